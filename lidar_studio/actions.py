@@ -1,8 +1,8 @@
 """Actions of a labelling session: apply(state, action, motion) returns the next state.
 
-An action is a dict with the fields of a line of the journal. It contains all computed values, so a
-journal can be replayed without a detector. Its tracks are Track objects; convert_tracks() converts
-them to and from the journal's form.
+An action is a dict with the fields of one journal entry. It contains all computed values, so a
+journal can be replayed without a detector. Tracks in it are Track objects; convert_tracks() converts
+them to and from JSON.
 """
 
 from __future__ import annotations
@@ -18,48 +18,54 @@ from lidar_studio.interpolation import Motion, apply_correction, reinterpolate_f
 from lidar_studio.state import ACCEPTED, KEY, PROPOSED, REJECTED, Box, Change, Seeds, Stack, State, Track
 
 Action = Mapping[str, Any]
-TrackChanges = dict[int, Track | None]  # track id -> new track, None if it is removed
-MAX_CLASS_LENGTH = 100  # maximum length of a class name
-WITH_TRACKS = "seed", "propose", "import"  # actions that carry tracks; in `merge`, `tracks` are ids
+TrackChanges = dict[int, Track | None]  # track id -> new track, or None to remove it
+MAX_CLASS_LENGTH = 100  # characters
+ACTIONS_WITH_TRACKS = "seed", "propose", "import"  # `merge` has a field `tracks` too, but it contains ids
 
 
 def convert_tracks(action: Action, convert: Callable[[Any], Any]) -> Action:
-    """Return an action, or a line of the journal, with converted tracks."""
-    if action.get("do") not in WITH_TRACKS or "tracks" not in action:
+    """Return a copy of an action or journal entry with `convert` applied to its tracks."""
+    if action.get("do") not in ACTIONS_WITH_TRACKS or "tracks" not in action:
         return action
     return {**action, "tracks": [convert(track) for track in action["tracks"]]}
 
 
 def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
-    """Apply an action. Return the next state and the change; raise InputError for an invalid action."""
+    """Apply an action; return the next state and the change. Raises InputError if the action is invalid."""
     name, motion = action.get("do"), with_scan_poses(state, motion)
     if name == "poses":  # not a manual edit, so it cannot be undone
         poses = tuple(tuple(map(float, row)) for row in action["poses"])
         return replace(state, poses=poses, seq=state.seq + 1), Change(
-            {}, (state.seeds, state.seeds), (state.checked, state.checked), (state.preserved, state.preserved)
+            {},
+            (state.seeds, state.seeds),
+            (state.checked_frames, state.checked_frames),
+            (state.preserved_fields, state.preserved_fields),
         )
     if name == "undo" or name == "redo":
         return _undo(state) if name == "undo" else _redo(state)
     if name not in HANDLERS:
         raise InputError(f"unknown action {str(name)[:40]!r}; known actions: {', '.join((*HANDLERS, 'undo', 'redo'))}")
-    tracks, seeds, checked = HANDLERS[name](state, action, motion)
+    tracks, seeds, checked_frames = HANDLERS[name](state, action, motion)
     change = Change(
         {n: (state.tracks.get(n), track) for n, track in tracks.items() if state.tracks.get(n) != track},
         (state.seeds, seeds),
-        (state.checked, checked),
-        (state.preserved, action.get("kept", state.preserved) if name == "import" else state.preserved),
+        (state.checked_frames, checked_frames),
+        (
+            state.preserved_fields,
+            action.get("kept", state.preserved_fields) if name == "import" else state.preserved_fields,
+        ),
     )
     undo_stack: Stack = (change, state.undo_stack)
     redo_stack: Stack = None
     if action.get("joins") and state.undo_stack is not None:  # completes the previous action
         undo_stack = state.undo_stack[0].combine_with(change), state.undo_stack[1]
-    elif action.get("beside"):  # not done by a person, so it does not affect undo and redo
+    elif action.get("beside"):  # not an action of a person, so it does not affect undo and redo
         undo_stack, redo_stack = state.undo_stack, state.redo_stack
     return replace(state.with_change(change), seq=state.seq + 1, undo_stack=undo_stack, redo_stack=redo_stack), change
 
 
 def with_scan_poses(state: State, motion: Motion) -> Motion:
-    """Return the motion of a drive, with the poses from scan matching if the drive has none."""
+    """Return the motion, with poses from scan matching added if the drive has none."""
     if motion.poses is not None or len(state.poses) != len(motion.times):
         return motion
     return Motion(motion.times, np.array(state.poses, np.float64).reshape(-1, 4, 4))
@@ -67,84 +73,88 @@ def with_scan_poses(state: State, motion: Motion) -> Motion:
 
 def _undo(state: State) -> tuple[State, Change]:
     if state.undo_stack is None:
-        raise InputError("there is nothing to undo")
-    change, rest = state.undo_stack
+        raise InputError("nothing to undo")
+    change, remaining_stack = state.undo_stack
     inverse = change.invert()
     return replace(
-        state.with_change(inverse), seq=state.seq + 1, undo_stack=rest, redo_stack=(change, state.redo_stack)
+        state.with_change(inverse), seq=state.seq + 1, undo_stack=remaining_stack, redo_stack=(change, state.redo_stack)
     ), inverse
 
 
 def _redo(state: State) -> tuple[State, Change]:
     if state.redo_stack is None:
-        raise InputError("there is nothing to redo")
-    change, rest = state.redo_stack
+        raise InputError("nothing to redo")
+    change, remaining_stack = state.redo_stack
     return replace(
-        state.with_change(change), seq=state.seq + 1, undo_stack=(change, state.undo_stack), redo_stack=rest
+        state.with_change(change), seq=state.seq + 1, undo_stack=(change, state.undo_stack), redo_stack=remaining_stack
     ), change
 
 
-Outcome = tuple[TrackChanges, Seeds, frozenset[int]]
+Outcome = tuple[TrackChanges, Seeds, frozenset[int]]  # changed tracks, all seeds, all checked frames
 
 
 def _replace_tracks(state: State, *tracks: Track) -> Outcome:
-    return {track.id: track for track in tracks}, state.seeds, state.checked
+    return {track.id: track for track in tracks}, state.seeds, state.checked_frames
 
 
 def require_frame(action: Action, motion: Motion, name: str = "frame") -> int:
-    """Return the frame index in a field of an action. InputError if the drive has no such frame."""
-    frame, frames = action.get(name), len(motion.times)
-    if not isinstance(frame, int) or isinstance(frame, bool) or not 0 <= frame < frames:
-        raise InputError(f"there is no frame {str(frame)[:40]}; the drive has 0 .. {frames - 1}")
+    """Return the frame index in field `name` of an action, or raise InputError if the drive has no such frame."""
+    frame, frame_count = action.get(name), len(motion.times)
+    if not isinstance(frame, int) or isinstance(frame, bool) or not 0 <= frame < frame_count:
+        raise InputError(f"frame {str(frame)[:40]} does not exist; valid frames are 0 to {frame_count - 1}")
     return frame
 
 
-def require_track(state: State, number: Any) -> Track:
-    """Return the track with an id. InputError if there is none."""
-    if not isinstance(number, int) or isinstance(number, bool) or number not in state.tracks:
-        raise InputError(f"there is no track {str(number)[:40]}; reload the page")
-    return state.tracks[number]
+def require_track(state: State, track_id: Any) -> Track:
+    """Return the track with an id, or raise InputError if it does not exist."""
+    if not isinstance(track_id, int) or isinstance(track_id, bool) or track_id not in state.tracks:
+        raise InputError(f"track {str(track_id)[:40]} does not exist; reload the page")
+    return state.tracks[track_id]
 
 
 def require_box(track: Track, frame: int) -> Box:
-    """Return the box of a track in a frame. InputError if it has none."""
+    """Return the box of a track in a frame, or raise InputError if it has none."""
     if frame not in track.boxes:
-        raise InputError(f"track {track.id} has no box in frame {frame}; copy one there first")
+        raise InputError(f"track {track.id} has no box in frame {frame}; copy a box to this frame first")
     return track.boxes[frame]
 
 
 def require_numbers(action: Action, name: str, count: int) -> tuple[float, ...]:
-    """Return the `count` numbers in a field of an action. InputError if they are not numbers
-    within MAX_RANGE."""
+    """Return the `count` numbers in field `name` of an action.
+
+    Raises:
+        InputError: The field is not a list of `count` numbers between -MAX_RANGE and MAX_RANGE.
+    """
     values = action.get(name)
     if (
         not isinstance(values, list | tuple)
         or len(values) != count
         or not all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= MAX_RANGE for v in values)
     ):
-        raise InputError(f"{name} must be {count} finite numbers within {MAX_RANGE:g}, not {str(values)[:80]}")
+        raise InputError(
+            f"{name} must be {count} numbers between -{MAX_RANGE:g} and {MAX_RANGE:g}, not {str(values)[:80]}"
+        )
     return tuple(map(float, values))
 
 
-def require_positive(values: tuple[float, ...]) -> tuple[float, ...]:
-    """Return length, width and height. InputError unless all are above 0."""
-    if min(values) <= 0:
-        raise InputError(f"length, width and height must be above 0, not {list(values)}")
-    return values
+def require_positive_size(size: tuple[float, ...]) -> None:
+    """Raise InputError unless length, width and height are positive."""
+    if min(size) <= 0:
+        raise InputError(f"length, width and height must be positive, not {list(size)}")
 
 
 def require_box_values(action: Action) -> tuple[float, ...]:
-    """Return the box of an action. InputError if it is invalid."""
+    """Return the box of an action, or raise InputError if it is invalid."""
     values = require_numbers(action, "box", 7)
-    require_positive(values[3:6])
+    require_positive_size(values[3:6])
     return values
 
 
 def require_class_name(action: Action) -> str:
-    """Return the class name in an action. InputError if it is empty, too long or not a text."""
+    """Return the class name in an action, or raise InputError if it is empty, too long or not a string."""
     name = action.get("class")
     if not isinstance(name, str) or not name.strip() or len(name) > MAX_CLASS_LENGTH:
-        raise InputError(f"a class is a name of up to {MAX_CLASS_LENGTH} characters, not {str(name)[:40]!r}")
+        raise InputError(f"invalid class name {str(name)[:40]!r}: expected 1 to {MAX_CLASS_LENGTH} characters")
     return name
 
 
@@ -155,18 +165,18 @@ def _get_computed_tracks(state: State, action: Action) -> TrackChanges:
 
 
 def _replace_with_computed(state: State, action: Action, motion: Motion) -> Outcome:
-    return _get_computed_tracks(state, action), state.seeds, state.checked
+    return _get_computed_tracks(state, action), state.seeds, state.checked_frames
 
 
 def _add_seed_track(state: State, action: Action, motion: Motion) -> Outcome:
     frame, track_id = require_frame(action, motion), action.get("track")
     if not isinstance(track_id, int):
-        raise InputError("a seed needs its track, which the server computes")
-    return _get_computed_tracks(state, action), add_seed(state.seeds, frame, track_id), state.checked
+        raise InputError("a seed action requires the integer field `track`, which the server adds")
+    return _get_computed_tracks(state, action), add_seed(state.seeds, frame, track_id), state.checked_frames
 
 
 def add_seed(seeds: Seeds, frame: int, track: int) -> Seeds:
-    """Add (frame, track) to the seeds unless it is one of them."""
+    """Return the seeds with (frame, track) added unless they already contain it."""
     return seeds if (frame, track) in seeds else (*seeds, (frame, track))
 
 
@@ -186,7 +196,8 @@ def _set_box(state: State, action: Action, motion: Motion) -> Outcome:
 
 def _set_size(state: State, action: Action, motion: Motion) -> Outcome:
     track = require_track(state, action.get("track"))
-    size = require_positive(require_numbers(action, "size", 3))
+    size = require_numbers(action, "size", 3)
+    require_positive_size(size)
     boxes = {}
     for frame, box in track.boxes.items():
         x, y, z, _, _, height, yaw = box.values
@@ -199,7 +210,7 @@ def _remove_box(state: State, action: Action, motion: Motion) -> Outcome:
     require_box(track, frame)
     boxes = {f: b for f, b in track.boxes.items() if f != frame}
     if not boxes:
-        return {track.id: None}, _drop_seeds(state.seeds, track.id), state.checked
+        return {track.id: None}, _drop_seeds(state.seeds, track.id), state.checked_frames
     removed = track.removed_frames | {frame}
     return _replace_tracks(state, replace(track, boxes=boxes, removed_frames=removed))
 
@@ -209,7 +220,9 @@ def _interpolate_track(state: State, action: Action, motion: Motion) -> Outcome:
     removed = track.removed_frames - {frame}
     boxes = reinterpolate_frame(track.boxes, removed, frame, motion)
     if boxes is None:
-        raise InputError(f"track {track.id} has no key box on both sides of frame {frame}")
+        raise InputError(
+            f"frame {frame} of track {track.id} cannot be interpolated: it needs a key box before and after"
+        )
     return _replace_tracks(state, replace(track, boxes=boxes, removed_frames=removed))
 
 
@@ -227,7 +240,8 @@ def _copy_box(state: State, action: Action, motion: Motion) -> Outcome:
 def _set_class(state: State, action: Action, motion: Motion) -> Outcome:
     track = require_track(state, action.get("track"))
     return _replace_tracks(
-        state, replace(track, class_name=require_class_name(action), edited=track.edited or track.state == PROPOSED)
+        state,
+        replace(track, class_name=require_class_name(action), is_edited=track.is_edited or track.state == PROPOSED),
     )
 
 
@@ -235,21 +249,21 @@ def _reject_rest(state: State, action: Action, motion: Motion) -> Outcome:
     class_name = require_class_name(action) if "class" in action else None
     undecided = [t for t in state.tracks.values() if t.state == PROPOSED and class_name in (None, t.class_name)]
     if not undecided:
-        raise InputError(f"no track{f' of class {class_name}' if class_name else ''} is left to reject")
+        raise InputError(f"no undecided tracks{f' of class {class_name}' if class_name else ''} to reject")
     return _replace_tracks(state, *(replace(t, state=REJECTED) for t in undecided))
 
 
 def _accept_track(state: State, action: Action, motion: Motion, new_state: str = ACCEPTED) -> Outcome:
     track, seeds = require_track(state, action.get("track")), state.seeds
-    if action.get("seed") is not None:  # frame in which the object is nearest
+    if action.get("seed") is not None:  # the frame in which the object is nearest
         seeds = add_seed(seeds, require_frame(action, motion, "seed"), track.id)
-    return {track.id: replace(track, state=new_state)}, seeds, state.checked
+    return {track.id: replace(track, state=new_state)}, seeds, state.checked_frames
 
 
 def _reject_track(state: State, action: Action, motion: Motion) -> Outcome:
     track = require_track(state, action.get("track"))
     seeds = _drop_seeds(state.seeds, track.id)
-    return {track.id: replace(track, state=REJECTED)}, seeds, state.checked
+    return {track.id: replace(track, state=REJECTED)}, seeds, state.checked_frames
 
 
 def _reopen_track(state: State, action: Action, motion: Motion) -> Outcome:
@@ -259,16 +273,21 @@ def _reopen_track(state: State, action: Action, motion: Motion) -> Outcome:
 def _merge_tracks(state: State, action: Action, motion: Motion) -> Outcome:
     pair = action.get("tracks")
     if not isinstance(pair, list | tuple) or len(pair) != 2 or pair[0] == pair[1]:
-        raise InputError("merging needs two different tracks; select a second one")
-    first, second = (require_track(state, number) for number in pair)
+        raise InputError("merging requires two different tracks; select another track")
+    first, second = (require_track(state, track_id) for track_id in pair)
     boxes = {**second.boxes, **first.boxes}
     boxes |= {f: b for f, b in second.boxes.items() if b.kind == KEY and boxes[f].kind != KEY}
     removed = (first.removed_frames | second.removed_frames) - boxes.keys()
     merged = replace(
-        first, boxes=boxes, removed_frames=removed, extra={**second.extra, **first.extra}, edited=True, nearby=False
+        first,
+        boxes=boxes,
+        removed_frames=removed,
+        extra={**second.extra, **first.extra},
+        is_edited=True,
+        is_partly_tracked=False,
     )
     seeds = tuple(dict.fromkeys((f, first.id if t == second.id else t) for f, t in state.seeds))
-    return {first.id: merged, second.id: None}, seeds, state.checked
+    return {first.id: merged, second.id: None}, seeds, state.checked_frames
 
 
 def _split_track(state: State, action: Action, motion: Motion) -> Outcome:
@@ -276,18 +295,18 @@ def _split_track(state: State, action: Action, motion: Motion) -> Outcome:
     earlier, later = ({f for f in track.boxes if (f >= frame) == is_after} for is_after in (False, True))
     if not earlier or not later:
         raise InputError(
-            f"track {track.id} has boxes on one side of frame {frame} only; split it between its first and last box"
+            f"track {track.id} cannot be split at frame {frame}: it needs boxes both before and from this frame on"
         )
 
-    def make_part(frames: set[int], number: int, is_after: bool) -> Track:
+    def make_part(frames: set[int], track_id: int, is_after: bool) -> Track:
         return replace(
             track,
-            id=number,
+            id=track_id,
             boxes={f: track.boxes[f] for f in sorted(frames)},
             removed_frames=frozenset(f for f in track.removed_frames if (f >= frame) == is_after),
             extra={f: v for f, v in track.extra.items() if (f >= frame) == is_after},
-            edited=True,
-            nearby=False,
+            is_edited=True,
+            is_partly_tracked=False,
         )
 
     new_id = state.next_id
@@ -295,7 +314,7 @@ def _split_track(state: State, action: Action, motion: Motion) -> Outcome:
     return (
         {track.id: make_part(earlier, track.id, False), new_id: make_part(later, new_id, True)},
         seeds,
-        state.checked,
+        state.checked_frames,
     )
 
 
@@ -304,22 +323,24 @@ def _trim_track(state: State, action: Action, motion: Motion) -> Outcome:
     side = action.get("side")
     if side not in ("before", "after"):
         raise InputError("side must be 'before' or 'after'")
-    outside = {f for f in range(len(motion.times)) if (f < frame if side == "before" else f > frame)}
-    removed_now = outside & track.boxes.keys()
-    remaining = {f: b for f, b in track.boxes.items() if f not in removed_now}
-    if not removed_now or not remaining:
-        raise InputError(f"track {track.id} has {'no' if remaining else 'only'} boxes {side} frame {frame}")
-    seeds = tuple(s for s in state.seeds if s[1] != track.id or s[0] not in removed_now)
-    # Tracking may later reach frames that have no box yet.
-    removed = track.removed_frames | (outside if track.nearby else removed_now)
-    return ({track.id: replace(track, boxes=remaining, removed_frames=removed)}, seeds, state.checked)
+    trimmed_frames = {f for f in range(len(motion.times)) if (f < frame if side == "before" else f > frame)}
+    frames_with_box = trimmed_frames & track.boxes.keys()
+    boxes = {f: b for f, b in track.boxes.items() if f not in frames_with_box}
+    if not frames_with_box:
+        raise InputError(f"track {track.id} has no boxes {side} frame {frame}")
+    if not boxes:
+        raise InputError(f"all boxes of track {track.id} are {side} frame {frame}; reject the track instead")
+    seeds = tuple(s for s in state.seeds if s[1] != track.id or s[0] not in frames_with_box)
+    # A partly tracked object has no boxes yet in some frames that tracking would add later.
+    removed = track.removed_frames | (trimmed_frames if track.is_partly_tracked else frames_with_box)
+    return {track.id: replace(track, boxes=boxes, removed_frames=removed)}, seeds, state.checked_frames
 
 
 def _set_checked(state: State, action: Action, motion: Motion) -> Outcome:
-    frame, checked = require_frame(action, motion), action.get("checked", True)
-    if not isinstance(checked, bool):
+    frame, is_checked = require_frame(action, motion), action.get("checked", True)
+    if not isinstance(is_checked, bool):
         raise InputError("checked must be true or false")
-    return {}, state.seeds, state.checked | {frame} if checked else state.checked - {frame}
+    return {}, state.seeds, state.checked_frames | {frame} if is_checked else state.checked_frames - {frame}
 
 
 HANDLERS: dict[str, Callable[[State, Action, Motion], Outcome]] = {
@@ -346,15 +367,15 @@ HANDLERS: dict[str, Callable[[State, Action, Motion], Outcome]] = {
 
 
 def round_box(values: np.ndarray[Any, Any]) -> list[float]:
-    """Round a computed box to a tenth of a millimetre, for the journal."""
+    """Round a computed box to 0.1 mm (and 0.1 mrad), to keep the journal short."""
     return [round(v, 4) for v in np.asarray(values, np.float64).tolist()]
 
 
 def strip_computed(action: Mapping[str, Any]) -> Action:
-    """Remove the fields that only the session may set."""
+    """Remove the fields that only the session may set. Raises InputError if a page sends poses."""
     if action.get("do") == "poses":
-        raise InputError("poses come from the drive")
-    computed = {
+        raise InputError("a page cannot set poses; they come from the recording or from scan matching")
+    computed_fields = {
         "seed": ("track", "tracks", "removed"),
         "propose": ("tracks", "removed"),
         "import": ("tracks", "removed", "kept"),
@@ -362,5 +383,5 @@ def strip_computed(action: Mapping[str, Any]) -> Action:
         "reopen": ("seed",),
         "snap": ("box",),
     }
-    removed_fields = ("seq", "time", "by", "joins", "beside", *computed.get(str(action.get("do")), ()))
+    removed_fields = ("seq", "time", "by", "joins", "beside", *computed_fields.get(str(action.get("do")), ()))
     return {k: v for k, v in action.items() if k not in removed_fields}

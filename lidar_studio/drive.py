@@ -1,4 +1,4 @@
-"""A drive to label or view: its frames, sensor poses, and a cache of segmented clouds."""
+"""A drive to label or view, with its frames, sensor poses and a cache of segmented clouds."""
 
 from __future__ import annotations
 
@@ -38,15 +38,18 @@ COLORS = (
     "#999999",
     "#666666",
 )  # colour-blind safe palette of Okabe and Ito, and two greys
-DEFAULT_SIZE_M = (1.0, 1.0, 1.0)  # size of a new box if its class has no usual size
+DEFAULT_SIZE_M = (1.0, 1.0, 1.0)  # size of new boxes of classes without a mean size
 
 
 @dataclass(frozen=True)
 class Scan:
-    """A segmented cloud. The points are in random order, so that the first ones are a sample.
+    """Segmented cloud of N points in random order, so that the first points are a random sample.
 
-    xyz (N, 3) float32 in metres, intensity (N,) uint8, ground (N,) bool, cluster_ids (N,) int32
-    with 0 for no cluster.
+    Attributes:
+        xyz: (N, 3) float32 in metres.
+        intensity: (N,) uint8.
+        ground: (N,) bool, True for ground points.
+        cluster_ids: (N,) int32, 0 for points without a cluster.
     """
 
     xyz: Array
@@ -60,7 +63,7 @@ class Scan:
         return sum(a.nbytes for a in (self.xyz, self.intensity, self.ground, self.cluster_ids))
 
     def encode(self) -> bytes:
-        """Return the bytes of /api/cloud: the magic LPC1, N, then the columns."""
+        """Return the response of /api/cloud: the magic bytes LPC1, N, then the columns."""
         count = len(self.xyz)
         return b"".join(
             (
@@ -76,31 +79,30 @@ class Scan:
 
 
 def make_pipeline_params(frame: Frame) -> PipelineParams:
-    """Return the parameters of the configuration `best`, for all directions and the sensor height of a
-    frame."""
+    """Return the configuration `best` for clouds all around the sensor, with the sensor height of a frame."""
     return with_values(BEST, {"view.enabled": False, "ground.sensor_pose.height": frame.sensor_height})
 
 
 def segment_frame(frame: Frame) -> Scan:
-    """Load the cloud of a frame and segment it. InputError if it cannot be read."""
+    """Load and segment the cloud of a frame. Raises InputError if it cannot be read."""
     cloud = frame.load()
     segmented = segment_cloud(cloud, None, make_pipeline_params(frame))
     return to_scan(cloud, segmented.ground, segmented.cluster_ids)
 
 
 def to_scan(cloud: PointCloud, ground: Array, cluster_ids: Array) -> Scan:
-    """Make the scan of N points with ground (N,) bool and cluster_ids (N,) int."""
+    """Make a scan from N points with ground (N,) bool and cluster_ids (N,) int."""
     order = np.random.default_rng(0).permutation(len(cloud))
     intensity = np.zeros(len(cloud)) if cloud.intensity is None else cloud.intensity
-    scaled = np.nan_to_num(np.clip(intensity, 0.0, 1.0)) * 255
-    return Scan(cloud.xyz[order], scaled[order].astype(np.uint8), ground[order], cluster_ids[order].astype(np.int32))
+    intensity = np.nan_to_num(np.clip(intensity, 0.0, 1.0)) * 255
+    return Scan(cloud.xyz[order], intensity[order].astype(np.uint8), ground[order], cluster_ids[order].astype(np.int32))
 
 
 class ScanCache:
-    """Thread-safe LRU cache of scans, up to `limit` bytes. Concurrent requests make a scan only once."""
+    """Thread-safe LRU cache of up to `max_bytes`. Concurrent requests for a frame make its scan only once."""
 
-    def __init__(self, make: Callable[[int], Scan], limit: int = MAX_CACHE_BYTES) -> None:
-        self._make, self._limit, self._size = make, limit, 0
+    def __init__(self, make_scan: Callable[[int], Scan], max_bytes: int = MAX_CACHE_BYTES) -> None:
+        self._make_scan, self._max_bytes, self._size = make_scan, max_bytes, 0
         self._scans: OrderedDict[int, Scan] = OrderedDict()
         self._locks: dict[int, threading.Lock] = {}
         self._lock = threading.Lock()
@@ -114,11 +116,11 @@ class ScanCache:
                 if (scan := self._scans.get(i)) is not None:
                     self._scans.move_to_end(i)
                     return scan
-            scan = self._make(i)
+            scan = self._make_scan(i)
             with self._lock:
                 self._scans[i] = scan
                 self._size += scan.nbytes
-                while self._size > self._limit and len(self._scans) > 1:
+                while self._size > self._max_bytes and len(self._scans) > 1:
                     index, oldest = self._scans.popitem(last=False)
                     self._locks.pop(index, None)
                     self._size -= oldest.nbytes
@@ -129,16 +131,17 @@ class ScanCache:
 class Drive:
     """A recording of one sequence.
 
-    scan: makes the scan of a frame; by default it segments the cloud.
+    Attributes:
+        make_scan: Function that makes the scan of a frame; by default, it segments the cloud.
     """
 
     name: str
     recording: Recording
-    scan: Callable[[Frame], Scan] = segment_frame
+    make_scan: Callable[[Frame], Scan] = segment_frame
 
     @cached_property
     def frames(self) -> list[Frame]:
-        """The frames in order of time."""
+        """Frames in order of time."""
         return list(self.recording.frames)
 
     @property
@@ -153,8 +156,7 @@ class Drive:
 
     @cached_property
     def journal_header(self) -> dict[str, Any]:
-        """Header of the drive's journal, with a digest of the first and last cloud, or "" if they
-        cannot be read."""
+        """First line of the drive's journal, with a digest of the first and last cloud if they can be read."""
         try:
             clouds = b"".join(self.frames[i].load().xyz.tobytes() for i in (0, -1))
         except InputError:
@@ -171,34 +173,34 @@ class Drive:
 
     @cached_property
     def motion(self) -> Motion:
-        """Times of the frames, with poses if every frame has one."""
+        """Times of the frames, and the sensor poses if every frame has a valid one."""
         stamps = np.array([frame.stamp_ns for frame in self.frames], np.int64)
         poses = [frame.pose() for frame in self.frames]
         if not poses or not all(map(is_valid_pose, poses)):
-            return Motion.of(stamps)
-        return Motion.of(stamps, np.array(poses, np.float64))
+            return Motion.from_stamps(stamps)
+        return Motion.from_stamps(stamps, np.array(poses, np.float64))
 
     @cached_property
     def load_scan(self) -> ScanCache:
-        """Function that returns the scan of a frame by its index, with a cache."""
-        return ScanCache(lambda i: self.scan(self.frames[i]))
+        """Cached function that returns the scan of frame i."""
+        return ScanCache(lambda i: self.make_scan(self.frames[i]))
 
 
 def select_drive(recording: Recording, sequence: str | None = None) -> Drive:
-    """Return the drive of a recording, or of one of its sequences.
+    """Return the only drive of a recording, or the one with this sequence name.
 
     Raises:
-        InputError: the recording has several drives and `sequence` is None, or has none of this
-            name.
+        InputError: The recording has several drives and `sequence` is None, or it has no drive with
+            this name.
     """
-    all_frames = recording.frames[:]  # a slice, because iterating over a bag keeps the clouds in memory
+    all_frames = recording.frames[:]  # a slice, because iteration over a bag keeps its clouds in memory
     names = list(dict.fromkeys(frame.sequence for frame in all_frames))
     names_text = f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}"
     if sequence is None and len(names) > 1:
-        raise InputError(f"{recording.path} has {len(names)} drives; name one with --sequence: {names_text}")
+        raise InputError(f"{recording.path} has {len(names)} drives; choose one with --sequence: {names_text}")
     if sequence is not None and sequence not in names:
         raise InputError(
-            f"{recording.path} has no drive {sequence}; it has {names_text}" + suggest_name(sequence, names)
+            f"{recording.path} has no drive {sequence}; available drives: {names_text}" + did_you_mean(sequence, names)
         )
     selected = names[0] if sequence is None else sequence
     frames = [frame for frame in all_frames if frame.sequence == selected]
@@ -207,21 +209,21 @@ def select_drive(recording: Recording, sequence: str | None = None) -> Drive:
 
 
 def require_clouds(drive: Drive) -> None:
-    """Raise InputError if the first, middle and last cloud are all unreadable."""
-    problems: list[InputError] = []
+    """Raise InputError if none of the first, middle and last cloud can be read."""
+    errors: list[InputError] = []
     for i in sorted({0, len(drive.frames) // 2, len(drive.frames) - 1}):
         try:
             drive.frames[i].load()
             return
         except InputError as error:
-            problems.append(error)
-    raise problems[0]
+            errors.append(error)
+    raise errors[0]
 
 
 def list_classes() -> list[dict[str, Any]]:
-    """Return the classes of the page: name, usual size, colour."""
-    named = [row for row in TABLE if row.name != "DontCare"]
+    """Return name, colour and mean size of each class, as JSON objects for the page."""
+    rows = [row for row in TABLE if row.name != "DontCare"]
     return [
         {"name": row.name, "color": color, "size": list(row.numbers.mean_size if row.numbers else DEFAULT_SIZE_M)}
-        for row, color in zip(named, COLORS)
+        for row, color in zip(rows, COLORS)
     ]

@@ -1,7 +1,7 @@
 """Journal file of a labelling session: every action is on disk before it takes effect.
 
-If the process is killed, only an incomplete last line is lost. The first line identifies the drive;
-each further line is a numbered action.
+If the process is killed, at most an incomplete last line is lost. The first line identifies the
+drive; each further line is a numbered action.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ def make_journal_header(
     """Make the first line of a journal, which identifies the drive by its frames.
 
     Args:
-        drive: name of the drive; not compared if `clouds` matches.
-        clouds: digest of some of the clouds, "" if unknown.
+        drive: Name of the drive. It is not compared if `clouds` matches.
+        clouds: Digest of some of the clouds, or "" if unknown.
         posed: True if the drive has sensor poses.
     """
     stamps = hashlib.sha256(" ".join(map(str, stamps_ns)).encode()).hexdigest()[:16]
@@ -48,10 +48,11 @@ def _encode(line: Mapping[str, Any]) -> bytes:
 
 
 class Journal:
-    """The journal of a folder.
+    """Journal in a folder.
 
-    lines: the actions that it had when it was opened.
-    message: a warning about the file, or None.
+    Attributes:
+        lines: Actions that the journal contained when it was opened.
+        message: Warning about the file, or None.
     """
 
     def __init__(self, folder: Path, header: Mapping[str, Any]) -> None:
@@ -75,16 +76,12 @@ class Journal:
             raise
 
     def append(self, line: Mapping[str, Any]) -> None:
-        """Write a line and sync it to disk. InputError if that fails, without changing the file."""
+        """Write a line and sync it to disk. Raises InputError, with the file unchanged, if that fails."""
         content, status = _encode(line), os.fstat(self._file)
-        if status.st_nlink == 0:  # the data would be lost when this process ends
-            raise InputError(
-                f"{self.path} was removed or replaced; nothing was done: export your labels and start again"
-            )
+        if status.st_nlink == 0:  # a file without a name is deleted when this process ends
+            raise InputError(f"{self.path} was removed or replaced; export your labels and restart the server")
         if status.st_size != self._size:  # possible on a file system without locks
-            raise InputError(
-                f"another process has written {self.path}; nothing was done: stop one of them and start again"
-            )
+            raise InputError(f"another process has written to {self.path}; stop one of the two and restart the other")
         try:
             view = memoryview(content)
             while view:
@@ -93,9 +90,7 @@ class Journal:
         except OSError as error:
             with suppress(OSError):
                 os.ftruncate(self._file, self._size)
-            raise InputError(
-                f"cannot write {self.path}: {error.strerror}; nothing was done: free disk space and try again"
-            ) from None
+            raise InputError(f"cannot write {self.path}: {error.strerror}; free disk space and try again") from None
         self._size += len(content)
 
     def close(self) -> None:
@@ -104,10 +99,10 @@ class Journal:
             os.close(self._file)
 
     def _read_lines(self) -> int:
-        """Read all lines, cut off an incomplete last one, and return the size of the file.
+        """Read all lines, remove an incomplete last line, and return the size of the file.
 
         Raises:
-            InputError: the journal is damaged, or belongs to another drive.
+            InputError: The journal is damaged or belongs to another drive.
         """
         with open(self.path, "rb") as stream:
             content = stream.read()
@@ -117,20 +112,20 @@ class Journal:
         if records:
             self._check_header(records[0])
         elif content and not _encode(self._header).startswith(content):
-            raise InputError(f"{self.path} is not a journal of labels; move it away")
+            raise InputError(f"{self.path} is not a labelling journal; move it away")
         if end < len(content):
             os.ftruncate(self._file, end)
             os.fsync(self._file)
             self.message = (
-                f"the last line of {self.path} was incomplete, so its "
-                f"{len(content) - end} bytes were cut off; one action may be lost"
+                f"the last line of {self.path} was incomplete and has been removed "
+                f"({len(content) - end} bytes); one action may be lost"
             )
         self.lines = records[1:]
         for number, line in enumerate(self.lines, 1):
             if line.get("seq") != number:
                 raise InputError(
-                    f"{self.path}:{number + 1} is action {line.get('seq')}, not "
-                    f"{number}; the file was changed by something else"
+                    f"{self.path}:{number + 1} has action number {line.get('seq')}, expected {number}; "
+                    "another program has changed the file: restore it or move it away"
                 )
         return end
 
@@ -142,12 +137,12 @@ class Journal:
             return line
         except (ValueError, RecursionError) as error:
             raise InputError(
-                f"{self.path}:{number} is not a line of a journal ({error}); restore the file or move it away"
+                f"{self.path}:{number} is not a valid journal entry ({error}); restore the file or move it away"
             ) from None
 
     def _check_header(self, header: Mapping[str, Any]) -> None:
         expected = dict(self._header)
-        if not header.get("clouds") or not expected["clouds"]:  # the clouds were unreadable
+        if not header.get("clouds") or not expected["clouds"]:  # the clouds could not be read
             expected.pop("clouds")
         elif header["clouds"] == expected["clouds"]:
             expected.pop("drive")
@@ -155,18 +150,17 @@ class Journal:
         if set(posed) == {True, False}:
             current, recorded = ("with" if value else "without" for value in posed)
             raise InputError(
-                f"{self.path} was made {recorded} sensor poses, but the drive is now "
-                f"{current} them, which would change all interpolated boxes; give the "
-                "drive as it was, or another --out"
+                f"{self.path} was recorded {recorded} sensor poses, but the drive is now opened {current} poses, "
+                "which would change all interpolated boxes; open the drive as before, or choose another --out"
             )
         if differences := find_differences({k: header.get(k) for k in expected}, expected):
             raise InputError(
-                f"{self.path} is the journal of another drive: {'; '.join(differences)}; give another --out"
+                f"{self.path} is the journal of another drive: {'; '.join(differences)}; choose another --out"
             )
 
 
 def _sync_folder(folder: Path) -> None:
-    """Sync a folder, so that the name of a new file is on disk too."""
+    """Sync a folder to disk, so that the name of a new file is not lost."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -176,7 +170,7 @@ def _sync_folder(folder: Path) -> None:
 
 @contextmanager
 def open_journal(folder: Path, header: Mapping[str, Any]) -> Iterator[Journal]:
-    """Open or create the journal of a folder. InputError if another process uses the folder."""
+    """Open or create the journal in a folder. Raises InputError if another process uses the folder."""
     with lock_folder(folder):
         journal = Journal(folder, header)
         try:

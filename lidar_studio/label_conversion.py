@@ -1,7 +1,7 @@
 """Conversion between tracks and the labels of a drive, for import and export.
 
-Other fields of an imported file are preserved for export: fields of a box in Track.extra, fields of
-a frame or of the drive in State.preserved.
+Further fields of an imported file are preserved for export: Track.extra contains fields of boxes, and
+State.preserved_fields contains fields of frames and of the drive.
 """
 
 from __future__ import annotations
@@ -22,11 +22,10 @@ ID, SCORE, REST = "track_id", "score", "rest"  # keys of Track.extra
 
 
 def to_tracks(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[str, Any]]:
-    """Convert labels to accepted tracks of key boxes, and to the value of State.preserved.
+    """Convert labels to accepted tracks of key boxes, and to the value of State.preserved_fields.
 
-    Track ids start at first_id.
-
-    Boxes with the same track id and class form a track; a box without an id is a separate track.
+    Boxes with the same track id and class form one track. A box without an id becomes a separate track.
+    The ids of the new tracks start at `first_id`.
     """
     tracks_by_key: dict[tuple[Any, ...], tuple[str, dict[int, Box], dict[int, dict[str, Any]]]] = {}
     for f, frame in enumerate(labels.frames):
@@ -38,10 +37,10 @@ def to_tracks(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[str
                 **({} if math.isnan(score) else {SCORE: score}),
             }
             key = (track_id, name) if track_id != NO_TRACK else (NO_TRACK, f, k)
-            if key in tracks_by_key and f in tracks_by_key[key][1]:  # the id occurs twice in one frame
+            if key in tracks_by_key and f in tracks_by_key[key][1]:  # the id occurs twice in this frame
                 key = NO_TRACK, f, k
             _, boxes, extra = tracks_by_key.setdefault(key, (name, {}, {}))
-            boxes[f], extra[f] = Box.of(frame.boxes[k], KEY), fields
+            boxes[f], extra[f] = Box.from_array(frame.boxes[k], KEY), fields
     tracks = [
         Track(track_id, name, ACCEPTED, 1.0, IMPORTED, boxes, frozenset(), extra)
         for track_id, (name, boxes, extra) in enumerate(tracks_by_key.values(), first_id)
@@ -50,30 +49,30 @@ def to_tracks(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[str
     return tracks, {"notes": notes, "extra": replace_non_finite(labels.extra)}
 
 
-def compute_digest(tracks: Sequence[Track], preserved: PreservedFields) -> str:
-    """Compute a digest of the result of to_tracks, independent of the ids."""
+def compute_digest(tracks: Sequence[Track], preserved_fields: PreservedFields) -> str:
+    """Compute a digest of the result of to_tracks(), independent of the track ids."""
     rows = [{**track_to_json(t), "id": 0} for t in tracks]
-    return hashlib.sha256(json.dumps([rows, preserved], sort_keys=True).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps([rows, preserved_fields], sort_keys=True).encode()).hexdigest()[:16]
 
 
-def join_extras(before: PreservedFields, new: PreservedFields) -> dict[str, Any]:
-    """Merge State.preserved with the preserved fields of another import."""
-    notes = {f: list(rows) for f, rows in before.get("notes", {}).items()}
-    for f, rows in new["notes"].items():
-        merged = notes.setdefault(f, [])
-        merged += [row for row in rows if row not in merged]
-    return {"notes": notes, "extra": {**before.get("extra", {}), **new["extra"]}}
+def merge_preserved_fields(old_fields: PreservedFields, new_fields: PreservedFields) -> dict[str, Any]:
+    """Merge State.preserved_fields with the preserved fields of another import."""
+    notes = {f: list(rows) for f, rows in old_fields.get("notes", {}).items()}
+    for f, rows in new_fields["notes"].items():
+        frame_notes = notes.setdefault(f, [])
+        frame_notes += [row for row in rows if row not in frame_notes]
+    return {"notes": notes, "extra": {**old_fields.get("extra", {}), **new_fields["extra"]}}
 
 
 def to_labels(state: State, frames: Sequence[Frame]) -> DriveLabels:
-    """Convert the accepted tracks to labels by frame, with the ids of imported tracks."""
+    """Convert the accepted tracks to labels by frame. Imported tracks keep their original ids."""
     ids = _choose_ids(state)
     rows: list[list[tuple[Track, Box, dict[str, Any]]]] = [[] for _ in frames]
-    for number in sorted(ids):
-        track = state.tracks[number]
+    for track_id in sorted(ids):
+        track = state.tracks[track_id]
         for f, box in track.boxes.items():
             rows[f].append((track, box, track.extra.get(f, {})))
-    notes = state.preserved.get("notes", {})
+    notes = state.preserved_fields.get("notes", {})
     return DriveLabels(
         [
             FrameLabels.of(
@@ -88,22 +87,22 @@ def to_labels(state: State, frames: Sequence[Frame]) -> DriveLabels:
             )
             for f, frame in enumerate(frames)
         ],
-        dict(state.preserved.get("extra", {})),
+        dict(state.preserved_fields.get("extra", {})),
     )
 
 
 def _choose_ids(state: State) -> dict[int, int]:
-    """Choose unique ids for the export of the accepted tracks, preferably the imported ones."""
+    """Choose unique ids for the export of the accepted tracks. Imported ids are kept where possible."""
     accepted = [t for t in state.tracks.values() if t.state == ACCEPTED]
     ids: dict[int, int] = {}
     used_ids = set[int]()
     for t in accepted:
         imported_ids = {extra[ID] for extra in t.extra.values() if ID in extra}
-        if len(t.boxes) > 1:  # a person has merged boxes without an id
+        if len(t.boxes) > 1:  # a person may have merged boxes without an id
             imported_ids.discard(NO_TRACK)
-        if len(imported_ids) == 1 and (number := imported_ids.pop()) not in used_ids:
-            ids[t.id] = number
-            used_ids |= {number} - {NO_TRACK}
+        if len(imported_ids) == 1 and (imported_id := imported_ids.pop()) not in used_ids:
+            ids[t.id] = imported_id
+            used_ids |= {imported_id} - {NO_TRACK}
     for t in accepted:
         if t.id not in ids:
             ids[t.id] = t.id if t.id not in used_ids else max(used_ids | set(state.tracks)) + 1

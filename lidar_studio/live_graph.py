@@ -1,4 +1,4 @@
-"""The newest frames of a running graph, for the page: clouds with the boxes of the same stamp.
+"""Newest frames of a running graph, which combine clouds and boxes with the same stamp.
 
 This module does not depend on ROS; the node in live_view.py adds the messages.
 """
@@ -23,10 +23,10 @@ from lidar_perception.wire.track_markers import read_trails
 from lidar_studio.drive import Scan
 from lidar_studio.results import (
     detections_with_sources,
+    get_source_name,
     layers_to_json,
     make_track_id,
     match_detections,
-    name_source,
     scan_from_message,
     tracks_to_json,
 )
@@ -35,25 +35,26 @@ from msg_utils.stamps import to_ns
 
 Array = np.ndarray[Any, Any]
 BOXES, TRACKS, LABELS = "detections", "tracks", "labels"  # kinds of box topics
-MAX_BYTES, MAX_FRAMES = 300 * 10**6, 300  # limits of the stored clouds: 30 s at 10 Hz
-MAX_WAIT_S = 0.5  # maximum wait of a cloud for its boxes; afterwards it is shown without them
-MAX_EARLY_ARRAYS = 50  # maximum number of early arrays per topic
+MAX_BYTES, MAX_FRAMES = 300 * 10**6, 300  # limits of the stored clouds; 300 frames are 30 s at 10 Hz
+MAX_WAIT_S = 0.5  # maximum time for which a cloud waits for its boxes before it is shown without them
+MAX_EARLY_ARRAYS = 50  # maximum number of stored arrays per topic whose cloud has not arrived
 
 
 @dataclass
 class BoxTopic:
     """A topic with boxes, and its statistics.
 
-    number: index among the topics of its kind.
-    late_count: number of arrays that arrived after their cloud was shown.
-    unmatched_count: number of arrays without a cloud.
-    tf_problem: reason why its boxes cannot be transformed to the cloud's frame, or "".
-    early_arrays: arrays whose cloud has not arrived yet, by stamp.
-    delays: of the last arrays after their clouds, in milliseconds.
+    Attributes:
+        index: Index among the topics of the same kind.
+        late_count: Number of arrays that arrived after their cloud was shown.
+        unmatched_count: Number of arrays without a cloud.
+        tf_problem: Reason why boxes cannot be transformed to the cloud's frame, or "".
+        early_arrays: Arrays whose cloud has not arrived yet, by stamp.
+        delays: Delays of the last arrays relative to their clouds, in milliseconds.
     """
 
     kind: str
-    number: int
+    index: int
     received_count: int = 0
     late_count: int = 0
     unmatched_count: int = 0
@@ -66,7 +67,9 @@ class BoxTopic:
 class LiveFrame:
     """A cloud (PointCloud2) with its objects and trails by topic.
 
-    received_s: time of arrival on the monotonic clock, in seconds.
+    Attributes:
+        received_s: Time of arrival on the monotonic clock, in seconds.
+        trails: Trails by topic and make_track_id(...).
     """
 
     number: int
@@ -74,19 +77,20 @@ class LiveFrame:
     cloud: Any
     received_s: float
     objects: dict[str, MarkedObjects] = field(default_factory=dict)
-    trails: dict[str, dict[int, Array]] = field(default_factory=dict)  # topic -> make_track_id(...) -> trail
+    trails: dict[str, dict[int, Array]] = field(default_factory=dict)
     is_shown: bool = False
 
 
 class LiveGraph:
-    """The newest frames of a running graph; thread-safe.
+    """Thread-safe store of the newest frames of a running graph.
 
-    Frames are numbered in order of arrival. Beyond max_frames or max_bytes, the oldest are dropped.
+    Frames are numbered in order of arrival. The oldest frames are dropped above max_frames or max_bytes.
 
-    listeners: called with every event of /api/events.
-    problems: problems with the topics, set by the node.
-    statistics: reception statistics of the clouds, set by the node.
-    tree: transforms of boxes in other frames; filled by the thread that adds clouds and boxes.
+    Attributes:
+        listeners: Functions called with every event of /api/events.
+        problems: Problems with the topics, set by the node.
+        statistics: Reception statistics of the clouds, set by the node.
+        tree: Transforms between frames, filled by the thread that adds clouds and boxes.
     """
 
     def __init__(self, name: str, max_bytes: int = MAX_BYTES, max_frames: int = MAX_FRAMES) -> None:
@@ -96,13 +100,13 @@ class LiveGraph:
         self.statistics: Mapping[str, Any] = {}
         self.topics: dict[str, BoxTopic] = {}
         self.tree = TransformTree()
-        self.skipped_count = 0  # number of clouds that arrived while a page was paused
+        self.skipped_count = 0  # clouds that arrived while a page was paused
         self._frames: dict[int, LiveFrame] = {}
         self._by_stamp: dict[int, LiveFrame] = {}
         self._next = self._bytes = 0
         self._paused_pages: set[int] = set()
         self._awaiting_tf: list[tuple[LiveFrame, str, MarkedObjects, Any]] = []
-        self._numbers: dict[tuple[str, str], int] = {}  # (kind, topic) -> BoxTopic.number
+        self._topic_indices: dict[tuple[str, str], int] = {}  # (kind, topic) -> BoxTopic.index
         self._last_status: dict[str, Any] = {}
         self._scale = StreamScale()
         self._lock = threading.RLock()
@@ -124,19 +128,19 @@ class LiveGraph:
             (self._paused_pages.add if paused else self._paused_pages.discard)(page)
 
     def expect_topic(self, topic: str, kind: str) -> None:
-        """Add a topic with boxes of a kind; clouds wait for its arrays."""
+        """Add a topic with boxes of a kind. Clouds wait for its arrays."""
         with self._lock:
             if topic not in self.topics:
-                number = sum(other_kind == kind for other_kind, _ in self._numbers)
-                self.topics[topic] = BoxTopic(kind, self._numbers.setdefault((kind, topic), number))
+                next_index = sum(other_kind == kind for other_kind, _ in self._topic_indices)
+                self.topics[topic] = BoxTopic(kind, self._topic_indices.setdefault((kind, topic), next_index))
 
     def forget_topic(self, topic: str) -> None:
-        """Remove a topic, such as one without publishers."""
+        """Remove a topic that should no longer be shown."""
         with self._lock:
             self.topics.pop(topic, None)
 
     def add_cloud(self, message: Any) -> None:
-        """Add a PointCloud2. Boxes are matched to the last cloud with their stamp, as bags may loop."""
+        """Add a PointCloud2. Boxes are matched to the last cloud with their stamp, because bags may loop."""
         with self._lock:
             stamp = to_ns(message.header.stamp)
             if self._paused_pages:
@@ -147,17 +151,21 @@ class LiveGraph:
             self._next += 1
             self._bytes += len(message.data)
             while len(self._frames) > 1 and (self._bytes > self.max_bytes or len(self._frames) > self.max_frames):
-                old = self._frames.pop(self.first)
-                if self._by_stamp.get(old.stamp_ns) is old:
-                    del self._by_stamp[old.stamp_ns]
-                self._bytes -= len(old.cloud.data)
+                oldest = self._frames.pop(self.first)
+                if self._by_stamp.get(oldest.stamp_ns) is oldest:
+                    del self._by_stamp[oldest.stamp_ns]
+                self._bytes -= len(oldest.cloud.data)
             for topic, box_topic in self.topics.items():
                 if stamp in box_topic.early_arrays:
                     self._add_objects(frame, topic, *box_topic.early_arrays.pop(stamp))
         self.update()
 
     def add_boxes(self, topic: str, objects: MarkedObjects, message: Any) -> None:
-        """Add an array of boxes. message: the MarkerArray with their trails, or None."""
+        """Add an array of boxes.
+
+        Args:
+            message: The MarkerArray that contains their trails, or None.
+        """
         with self._lock:
             if (box_topic := self.topics.get(topic)) is None:
                 return
@@ -175,9 +183,9 @@ class LiveGraph:
         self.update()
 
     def _add_objects(self, frame: LiveFrame, topic: str, objects: MarkedObjects, message: Any) -> None:
-        """Transform boxes to the cloud's coordinates and add them to its frame.
+        """Transform boxes to the frame of the cloud and add them to `frame`.
 
-        If TF is late, they are added by a later update().
+        If their transform has not arrived yet, a later update() adds them.
         """
         box_topic, frame_id = self.topics[topic], frame.cloud.header.frame_id
         trails = read_trails(message) if message is not None and box_topic.kind == TRACKS else {}
@@ -194,15 +202,17 @@ class LiveGraph:
             trails = {number: transform_points(trail, pose) for number, trail in trails.items()}
         box_topic.tf_problem = ""
         frame.objects[topic] = objects
-        frame.trails[topic] = {make_track_id(box_topic.number, n): trail for n, trail in trails.items()}
+        frame.trails[topic] = {make_track_id(box_topic.index, n): trail for n, trail in trails.items()}
         if frame.is_shown:
-            # Labels may arrive at any time, and clouds do not wait for the first array of a topic.
+            # Clouds wait neither for labels nor for the first array of a topic, so these are not late.
             box_topic.late_count += box_topic.kind != LABELS and box_topic.received_count > 1
             self._notify(self._make_event(frame))
 
     def update(self) -> None:
-        """Show the newest frame that is complete or has waited MAX_WAIT_S, and report a changed
-        status. Call it periodically."""
+        """Show the newest frame that is complete or has waited for MAX_WAIT_S, and report status changes.
+
+        This method must be called periodically.
+        """
         with self._lock:
             now = monotonic()
             awaiting_tf, self._awaiting_tf = self._awaiting_tf, []
@@ -230,7 +240,7 @@ class LiveGraph:
             listener(event)
 
     def get_status(self) -> dict[str, Any]:
-        """Return the problems as text, and the statistics of the clouds and of each box topic."""
+        """Return the problems as lines of text, and the statistics of the clouds and of each box topic."""
         with self._lock:
             lines = [
                 *self.problems,
@@ -265,7 +275,7 @@ class LiveGraph:
             if box_topic.kind != TRACKS:
                 continue
             objects = {f.number: f.objects[topic] for f in frames if topic in f.objects}
-            for track in tracks_to_json(objects, topic, box_topic.number):
+            for track in tracks_to_json(objects, topic, box_topic.index):
                 track["trails"] = {
                     f.number: np.round(f.trails[topic][track["id"]], 3).tolist()
                     for f in frames
@@ -275,29 +285,29 @@ class LiveGraph:
         return tracks
 
     def list_tracks(self) -> list[dict[str, Any]]:
-        """Return the tracks in all shown frames, as JSON objects of the page."""
+        """Return the tracks in all shown frames, as JSON objects for the page."""
         with self._lock:
             return self._tracks_to_json([f for f in self._frames.values() if f.is_shown])
 
     def list_frames(self) -> list[dict[str, Any]]:
-        """Return the shown frames, in the form of /api/drive."""
+        """Return the shown frames, as JSON objects of /api/drive."""
         with self._lock:
             return [_frame_to_json(frame) for frame in self._frames.values() if frame.is_shown]
 
     def _get_frame(self, i: int) -> LiveFrame:
         with self._lock:
             if (frame := self._frames.get(i)) is None:
-                raise InputError(f"frame {i} is no longer stored; the oldest is {self.first}")
+                raise InputError(f"frame {i} is no longer stored; the oldest stored frame is {self.first}")
             return frame
 
     def load_scan(self, i: int) -> Scan:
-        """Return the scan of a frame. InputError if the cloud is invalid or no longer stored."""
+        """Return the scan of a frame. Raises InputError if the cloud is invalid or no longer stored."""
         return scan_from_message(self._get_frame(i).cloud, scale=self._scale)
 
-    def layers(self, i: int, min_score: float) -> dict[str, Any]:
-        """Return the labels, detections and missed labels of a frame, in the form of /api/labels.
+    def make_layers(self, i: int, min_score: float) -> dict[str, Any]:
+        """Return the JSON object of /api/labels: labels, detections and missed labels of a frame.
 
-        False detections are not listed, because the labelled area is unknown.
+        It lists no false positives, because the labelled area is unknown.
         """
         with self._lock:
             objects = self._get_frame(i).objects
@@ -305,7 +315,7 @@ class LiveGraph:
                 kind: {t: o for t, o in objects.items() if t in self.topics and self.topics[t].kind == kind}
                 for kind in (BOXES, LABELS)
             }
-        detections = {name_source(t): detections_with_sources(o) for t, o in objects_by_kind[BOXES].items()}
+        detections = {get_source_name(t): detections_with_sources(o) for t, o in objects_by_kind[BOXES].items()}
         truth = next((to_truth(o) for o in objects_by_kind[LABELS].values()), None)
         matches = (
             {}
@@ -319,18 +329,18 @@ class LiveGraph:
 
 
 def _keep_valid(objects: MarkedObjects) -> MarkedObjects:
-    """Drop objects with numbers that are not finite, or sizes that are not positive."""
-    valid = (
+    """Drop objects with non-finite numbers or non-positive sizes."""
+    is_valid = (
         np.isfinite(objects.boxes).all(axis=1) & (objects.boxes[:, 3:6] > 0).all(axis=1) & np.isfinite(objects.scores)
     )
-    if valid.all():
+    if is_valid.all():
         return objects
-    rows = np.flatnonzero(valid).tolist()
+    rows = np.flatnonzero(is_valid).tolist()
     return replace(
         objects,
-        boxes=objects.boxes[valid],
-        scores=objects.scores[valid],
-        ids=objects.ids[valid],
+        boxes=objects.boxes[is_valid],
+        scores=objects.scores[is_valid],
+        ids=objects.ids[is_valid],
         labels=[objects.labels[k] for k in rows],
         extras=[objects.extras[k] for k in rows],
     )

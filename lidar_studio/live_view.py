@@ -1,4 +1,4 @@
-"""Node of `view --live`: receives the messages of a running graph for the page."""
+"""ROS node of `view --live`, which receives the messages of a running graph."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from msg_utils.detections import from_detection_array
 from msg_utils.markers import from_marker_array
 from msg_utils.messages import load_message_class
 
-SCAN_PERIOD_S = 1.0  # period at which the list of topics is updated
-STOP_TIMEOUT_S = 5.0  # time to handle the last message
+TOPIC_UPDATE_PERIOD_S = 1.0
+STOP_TIMEOUT_S = 5.0  # maximum time to wait for the thread to end
 RECEPTION = ReceptionParams(queue=5)
 SHOWN_PROBLEMS = "publishers", "silent", "stale", "lost", "dropped"  # kinds of Reception.problems
 
 
 class LiveView(ExternalNode):
-    """Subscriber to the topics of a graph while run() is running.
+    """Node that subscribes to the topics of a running graph while run() is executed.
 
     Args:
-        clouds: topic of the clouds; "" to choose one by select_cloud_topic.
-        boxes: topics of detections; () to choose them by select_box_topics.
+        clouds: Topic of the clouds, or "" to select one with select_cloud_topic().
+        boxes: Topics of detections, or () to select them with select_box_topics().
     """
 
     def __init__(
@@ -53,8 +53,8 @@ class LiveView(ExternalNode):
         self.live, self.namespace = live, namespace
         self.requested_clouds, self.requested_boxes = clouds, tuple(boxes)
         self.receptions: dict[str, Reception] = {}
-        self.decode_errors: dict[str, str] = {}  # topic -> error of its last message
-        self.clouds, self.problem, self._last_scan = "", "", -math.inf
+        self.decode_errors: dict[str, str] = {}  # topic -> error in its last message
+        self.clouds, self.problem, self._last_topic_update = "", "", -math.inf
         if has_tf():
             for topic, qos in ((TF, TF_QOS), (TF_STATIC, STATIC_QOS)):
                 self.node.create_subscription(
@@ -68,26 +68,26 @@ class LiveView(ExternalNode):
                 )
 
     def run(self, stop: threading.Event) -> None:
-        """Spin until `stop` is set. An exception is shown on the page and raised."""
+        """Spin until `stop` is set. Exceptions are shown on the page and re-raised."""
         try:
             self.spin_until(stop.is_set, math.inf, self._step)
-        except Exception as error:  # logged here because nobody joins this thread
+        except Exception as error:  # show it on the page, because nobody joins this thread
             self.live.problems = [
-                f"reception has stopped: {type(error).__name__}: {shorten_error(error)}; start view again"
+                f"reception has stopped: {type(error).__name__}: {shorten_error(error)}; restart lidar-perception view"
             ]
             self.live.update()
             raise
 
     def _step(self) -> None:
-        if monotonic() - self._last_scan >= SCAN_PERIOD_S:
-            self._last_scan = monotonic()
+        if monotonic() - self._last_topic_update >= TOPIC_UPDATE_PERIOD_S:
+            self._last_topic_update = monotonic()
             self.update_topics()
         self.live.update()
 
     def update_topics(self) -> None:
-        """Subscribe to the topics to show, and unsubscribe from others.
+        """Subscribe to the topics to show, and unsubscribe from all others.
 
-        A cloud topic whose publisher has gone is kept until there is another one.
+        A cloud topic that has lost its publisher is kept until another cloud topic appears.
         """
         types = {
             topic: kinds[0]
@@ -165,7 +165,7 @@ class LiveView(ExternalNode):
 
 @contextmanager
 def run_live_view(live: LiveGraph, *arguments: Any) -> Iterator[None]:
-    """Run a LiveView, made with these arguments, in a thread while the context is open."""
+    """Create a LiveView with these arguments, and run it in a thread while the context is open."""
     with LiveView(live, *arguments) as view:
         stop = threading.Event()
         thread = threading.Thread(target=view.run, args=(stop,), daemon=True)

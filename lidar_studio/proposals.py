@@ -1,4 +1,4 @@
-"""Proposed tracks of a drive, from detections and from clusters that are similar to seeds."""
+"""Proposal of tracks from detections and from clusters that are similar to seeds."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ from lidar_studio.survey import FrameSurvey
 Array = np.ndarray[Any, Any]
 PlacedBox = tuple[Array, str]  # box (7,) and its class
 Hit = tuple[int, Array, int, float, bool]  # (frame, box, class id, score, True for a candidate)
-SAME_OBJECT_DISTANCE_M = 0.6  # max centre distance of a candidate and a detection of the same person
+SAME_OBJECT_DISTANCE_M = 0.6  # max distance between the centres of a candidate and a detection of the same person
 MIN_CONFIDENCE = 0.3  # minimum confidence of a candidate
-UNDETECTED_WEIGHT = 0.5  # weight of the size similarity for objects without a detection
-MIN_HITS = 2  # minimum detections of a proposed track, unless there is only one frame
+UNDETECTED_WEIGHT = 0.5  # factor for the size similarity of clusters that the detector did not detect
+MIN_HITS = 2  # minimum number of detections per proposed track, unless there is only one frame
 MIN_SCORE = 0.3  # minimum score of a proposed track
-PLACED_SCORE = 0.95  # score of a box placed by a person
-CANDIDATES = "candidates"  # source of a track without detections
+PLACED_SCORE = 0.95  # score of a box that a person placed
+CANDIDATES = "candidates"  # source of tracks that come mainly from candidates
 MAX_HIT_DISTANCE_M = 1.0  # maximum distance between a track and the detection that updated it
 NO_HIT = -1
-# Standard deviations of a cluster's size, as fractions of the seed's length, width or height. Hidden
-# parts make a cluster shorter, so a deficit in length counts less than an excess.
+# Standard deviations of a cluster's size, as fractions of the seed's length, width or height. Occlusion
+# makes a cluster shorter, so its length may be further below the seed's length than above it.
 LENGTH_EXCESS, LENGTH_DEFICIT, WIDTH_EXCESS, HEIGHT_DEVIATION = 0.12, 0.3, 0.2, 0.12
-END_VIEW_PENALTY = 0.5  # deviation added where only the front or rear may be visible
-# The tracker reports every track; uncertain ones are dropped at the end.
+END_VIEW_PENALTY = 0.5  # deviation added if only the front or rear of an object is assumed to be visible
+# Make the tracker report all tracks; propose_tracks() drops those with a low score.
 ALL_TRACKS = TrackingParams(report=0.0, report_unseen=0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class SilhouetteSeed:
-    """A pedestrian seed: its silhouette (80,) uint32 and its height in metres."""
+    """Silhouette (80,) uint32 and height (m) of a pedestrian that a person clicked."""
 
     image: Array
     height: float
@@ -53,7 +53,7 @@ class SilhouetteSeed:
 
 @dataclass(frozen=True)
 class SizeSeed:
-    """A seed of another class: a name in CLASSES, and length, width and height in metres."""
+    """Class name (from CLASSES), and length, width and height (m) of another object that a person clicked."""
 
     class_name: str
     size: Size
@@ -61,44 +61,51 @@ class SizeSeed:
 
 @dataclass(frozen=True)
 class ProposalRequest:
-    """Seeds of the objects to propose, and the boxes that a person placed, by frame.
+    """Seeds of the objects to propose.
 
-    detected: the survey has detections, so that clusters of a seed's size count less.
+    Attributes:
+        placed_boxes: Boxes that a person placed, by frame.
+        has_detections: True if the survey contains detections, so that clusters of the same size as a seed
+            are less likely to be objects.
     """
 
-    seeds: Sequence[SilhouetteSeed] = ()
-    sizes: Sequence[SizeSeed] = ()
-    placed: Mapping[int, Sequence[PlacedBox]] = field(default_factory=dict)
-    detected: bool = False
+    silhouette_seeds: Sequence[SilhouetteSeed] = ()
+    size_seeds: Sequence[SizeSeed] = ()
+    placed_boxes: Mapping[int, Sequence[PlacedBox]] = field(default_factory=dict)
+    has_detections: bool = False
 
 
-def compute_likeness(survey: FrameSurvey, seeds: Sequence[SilhouetteSeed]) -> Array:
-    """Compute the probability that each cluster is a person, (C,) float64, from its most similar
-    seed; 0 without seeds."""
-    likeness = np.zeros(len(survey.boxes))
+def compute_person_probabilities(survey: FrameSurvey, seeds: Sequence[SilhouetteSeed]) -> Array:
+    """Compute the probability (C,) float64 that each cluster is a person, from its most similar seed.
+
+    Without seeds, the probability is 0.
+    """
+    probabilities = np.zeros(len(survey.boxes))
     for seed in seeds if len(survey.boxes) else ():
         similarity = compute_similarity(survey.images, seed.image, BEST.stm)
-        likeness = np.maximum(
-            likeness, compute_confidence(survey.features, similarity, survey.features["height_m"] - seed.height)
-        )
-    return likeness
+        height_differences = survey.features["height_m"] - seed.height
+        probabilities = np.maximum(probabilities, compute_confidence(survey.features, similarity, height_differences))
+    return probabilities
 
 
 def compute_size_similarity(shapes: Array, size: Size) -> Array:
-    """Compute how well clusters fit the visible part of an object of a size, (T,) float64 in 0..1.
+    """Compute how well clusters match the visible part of an object with a known size.
 
     Objects longer than LONG_OBJECT_M may show only their front or rear, so the longer side of a
-    cluster may also be the width.
+    cluster may also be the width of the object.
 
     Args:
-        shapes: (T, 7) L-shapes of the clusters, down to the ground.
-        size: length, width and height in metres.
+        shapes: (T, 7) L-shapes of the clusters, which reach down to the ground.
+        size: Length, width and height in metres.
+
+    Returns:
+        (T,) float64 from 0 to 1.
     """
     length, width, height = size
     lengths, widths, heights = (shapes[:, k].astype(np.float64) for k in (3, 4, 5))
-    excess = lengths / length - 1
+    excess_length = lengths / length - 1
     deviation = np.hypot(
-        np.where(excess > 0, excess / LENGTH_EXCESS, excess / LENGTH_DEFICIT),
+        np.where(excess_length > 0, excess_length / LENGTH_EXCESS, excess_length / LENGTH_DEFICIT),
         np.maximum(widths / width - 1, 0) / WIDTH_EXCESS,
     )
     if length > LONG_OBJECT_M:
@@ -107,25 +114,25 @@ def compute_size_similarity(shapes: Array, size: Size) -> Array:
 
 
 def find_objects(
-    survey: FrameSurvey, request: ProposalRequest, placed: Sequence[PlacedBox] = ()
+    survey: FrameSurvey, request: ProposalRequest, placed_boxes: Sequence[PlacedBox] = ()
 ) -> tuple[Detections, Array]:
-    """Return the objects of a frame, and a mask (K,) bool of the candidates among them.
+    """Return the K objects of a frame, and a mask (K,) bool that is True for candidates.
 
-    Objects are detections, candidates where there is no detection, and boxes that a person placed,
-    which replace others at the same place.
+    Objects are detections, candidates without a detection nearby, and boxes that a person placed.
+    Placed boxes replace other objects in the same position.
     """
-    detections, candidates = _add_similar_objects(survey, request, *_find_people(survey, request.seeds))
-    for box, name in placed:
+    objects, is_candidate = _add_similar_objects(survey, request, *_find_people(survey, request.silhouette_seeds))
+    for box, name in placed_boxes:
         if name in CLASSES:
-            distances = centre_distances(detections.boxes, box[None])[:, 0]
-            others = distances > max(SAME_OBJECT_DISTANCE_M, box[3] / 3)
-            detections = detections[others].concatenate(Detections.of(box, CLASSES.index(name), PLACED_SCORE))
-            candidates = np.append(candidates[others], False)
-    return detections, candidates
+            distances = centre_distances(objects.boxes, box[None])[:, 0]
+            is_other = distances > max(SAME_OBJECT_DISTANCE_M, box[3] / 3)
+            objects = objects[is_other].followed_by(Detections.of(box, CLASSES.index(name), PLACED_SCORE))
+            is_candidate = np.append(is_candidate[is_other], False)
+    return objects, is_candidate
 
 
 def _find_people(survey: FrameSurvey, seeds: Sequence[SilhouetteSeed]) -> tuple[Detections, Array]:
-    scores = compute_likeness(survey, seeds)
+    scores = compute_person_probabilities(survey, seeds)
     likely = np.flatnonzero(scores >= MIN_CONFIDENCE)
     detections = survey.detections
     people = detections.boxes[np.isin(detections.class_ids, NOT_VEHICLE_IDS)]
@@ -138,23 +145,23 @@ def _find_people(survey: FrameSurvey, seeds: Sequence[SilhouetteSeed]) -> tuple[
 
 
 def _add_similar_objects(
-    survey: FrameSurvey, request: ProposalRequest, detections: Detections, candidates: Array
+    survey: FrameSurvey, request: ProposalRequest, objects: Detections, is_candidate: Array
 ) -> tuple[Detections, Array]:
-    """Add clusters of about the size of a seed, where there is no object."""
-    sizes = request.sizes
-    if not sizes or not len(survey.shapes):
-        return detections, candidates
-    scores = np.array([compute_size_similarity(survey.shapes, seed.size) for seed in sizes])
-    scores *= UNDETECTED_WEIGHT if request.detected else 1.0
+    """Add clusters of about the same size as a seed, where there is no other object."""
+    seeds = request.size_seeds
+    if not seeds or not len(survey.shapes):
+        return objects, is_candidate
+    scores = np.array([compute_size_similarity(survey.shapes, seed.size) for seed in seeds])
+    scores *= UNDETECTED_WEIGHT if request.has_detections else 1.0
     best_seed = scores.argmax(axis=0)
     likely = np.flatnonzero(scores.max(axis=0) >= MIN_CONFIDENCE)
     shapes = survey.shapes[likely].astype(np.float64)
-    boxes = np.array([complete_box(b, sizes[best_seed[k]].size) for k, b in zip(likely, shapes)]).reshape(-1, 7)
+    boxes = np.array([complete_box(b, seeds[best_seed[k]].size) for k, b in zip(likely, shapes)]).reshape(-1, 7)
     min_distances = np.maximum(SAME_OBJECT_DISTANCE_M, boxes[:, None, 3] / 3)
-    is_new = (centre_distances(boxes, detections.boxes) > min_distances).all(axis=1)
-    classes = np.array([CLASSES.index(sizes[k].class_name) for k in best_seed[likely]], np.int32)
-    objects = detections.concatenate(Detections.of(boxes[is_new], classes[is_new], scores.max(axis=0)[likely][is_new]))
-    return objects, np.append(candidates, np.ones(int(is_new.sum()), bool))
+    is_new = (centre_distances(boxes, objects.boxes) > min_distances).all(axis=1)
+    classes = np.array([CLASSES.index(seeds[k].class_name) for k in best_seed[likely]], np.int32)
+    new_objects = Detections.of(boxes[is_new], classes[is_new], scores.max(axis=0)[likely][is_new])
+    return objects.followed_by(new_objects), np.append(is_candidate, np.ones(int(is_new.sum()), bool))
 
 
 NOT_VEHICLE_IDS = [i for i, kind in enumerate(MODEL_BY_CLASS_ID) if kind != MODEL_BY_CLASS_ID[0]]
@@ -168,20 +175,20 @@ def propose_tracks(
     frames: range,
     on_progress: Callable[[int], bool] = lambda count: True,
 ) -> list[Track] | None:
-    """Return the tracks in consecutive frames of a surveyed drive, the most certain first.
+    """Propose tracks in consecutive frames of a surveyed drive.
 
     Args:
-        surveys: of all F frames of the drive.
-        on_progress: called with the number of finished frames; returns False to cancel.
+        surveys: Surveys of all frames of the drive.
+        on_progress: Function called with the number of finished frames, which returns False to cancel.
 
     Returns:
-        Tracks with id 0, or None if cancelled.
+        Tracks with id 0 in order of decreasing score, or None if cancelled.
     """
     tracker, hits = Tracker(ALL_TRACKS), dict[int, list[Hit]]()
     for i in frames:
         if not on_progress(i - frames.start):
             return None
-        objects, candidates = find_objects(surveys[i], request, request.placed.get(i, ()))
+        objects, is_candidate = find_objects(surveys[i], request, request.placed_boxes.get(i, ()))
         pose = None if motion.poses is None else motion.poses[i]
         tracks = tracker(objects, stamps_ns[i], pose)
         matches = _match_detections(tracks, objects)
@@ -189,16 +196,18 @@ def propose_tracks(
             match, box = matches[k], tracks.detections.boxes[k].astype(np.float64)
             box[:3] = objects.boxes[match, :3]
             hits.setdefault(int(tracks.ids[k]), []).append(
-                (i, box, int(tracks.detections.class_ids[k]), float(objects.scores[match]), bool(candidates[match]))
+                (i, box, int(tracks.detections.class_ids[k]), float(objects.scores[match]), bool(is_candidate[match]))
             )
     min_hits = min(MIN_HITS, len(frames))
-    proposed = [_make_track(rows, motion) for rows in hits.values() if len(rows) >= min_hits]
-    return sorted((t for t in proposed if t.score >= MIN_SCORE), key=lambda t: -t.score)
+    all_tracks = [_make_track(rows, motion) for rows in hits.values() if len(rows) >= min_hits]
+    return sorted((t for t in all_tracks if t.score >= MIN_SCORE), key=lambda t: -t.score)
 
 
 def _match_detections(tracks: Tracks, detections: Detections) -> np.ndarray:
-    """Return the detection that updated each track, (K,) int64: the nearest one within
-    MAX_HIT_DISTANCE_M, or NO_HIT."""
+    """Return the index (K,) int64 of the detection that updated each track, or NO_HIT.
+
+    It is the nearest detection within MAX_HIT_DISTANCE_M.
+    """
     if len(detections) == 0:
         return np.full(len(tracks), NO_HIT)
     distances = centre_distances(tracks.detections.boxes, detections.boxes)
@@ -207,12 +216,12 @@ def _match_detections(tracks: Tracks, detections: Detections) -> np.ndarray:
 
 
 def _make_track(hits: list[Hit], motion: Motion) -> Track:
-    frames, boxes, classes, scores, candidates = zip(*hits)
+    frames, boxes, classes, scores, is_candidate = zip(*hits)
     name = CLASSES[np.bincount(classes, weights=scores).argmax()]
     size = np.median([b[3:6] for b in boxes], axis=0)
     boxes_by_frame = {}
     for frame, box in zip(frames, boxes):
         box[3:6] = size
-        boxes_by_frame[frame] = Box.of(np.round(box, 4), PROPOSED)
-    source = CANDIDATES if np.mean(candidates) > 0.5 else FUSED
+        boxes_by_frame[frame] = Box.from_array(np.round(box, 4), PROPOSED)
+    source = CANDIDATES if np.mean(is_candidate) > 0.5 else FUSED
     return Track(0, name, PROPOSED, round(float(np.mean(scores)), 4), source, fill_gaps(boxes_by_frame, motion))

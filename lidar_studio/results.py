@@ -1,4 +1,4 @@
-"""Results to view: labels, tracks, and detections by source, with missed and false ones.
+"""Results to view: labels, tracks and detections, with misses and false positives.
 
 Detections are read from a bag or from result files, or a detector computes them on request.
 """
@@ -36,36 +36,37 @@ from msg_utils.markers import MarkedObjects
 Array = np.ndarray[Any, Any]
 SIMILAR_CLASS = {row.name: row.looks_like or row.name for row in TABLE}
 CLUSTERED_TOPICS = ("/clustering/output/points", "/perception/output/points")
-MAX_SOURCES = 8  # maximum number of sources shown per detection
+MAX_SOURCES = 8  # maximum number of probabilities shown per detection
 MAX_CACHED_FRAMES = 2000
-TRACKER_ID_STEP = 10**10  # offset between the ids of two trackers; larger than any 32-bit marker id
+TRACKER_ID_STEP = 10**10  # offset between the track ids of two trackers; larger than any 32-bit marker id
 
 
 @dataclass(frozen=True)
 class Source:
     """A source of detections.
 
-    find: returns the detections in frame i, from (i, frame).
-    classes: names of the classes that the source can detect.
+    Attributes:
+        detect: Function of (frame index, frame) that returns the detections in the frame.
+        classes: Names of the classes that the source can detect.
     """
 
-    find: Callable[[int, Frame], Detections]
+    detect: Callable[[int, Frame], Detections]
     classes: frozenset[str] = frozenset(DETECTED)
 
 
 @dataclass(frozen=True)
 class Results:
-    """Sources by name, and tracks as JSON objects of the page."""
+    """Detection sources by name, and tracks as JSON objects for the page."""
 
     sources: Mapping[str, Source] = field(default_factory=dict)
     tracks: tuple[dict[str, Any], ...] = ()
 
-    def layers(self, i: int, frame: Frame, min_score: float) -> dict[str, Any]:
-        """Return the JSON object of /api/labels for frame i: labels and detections, with the missed
-        and false ones at a minimum score."""
+    def make_layers(self, i: int, frame: Frame, min_score: float) -> dict[str, Any]:
+        """Return the JSON object of /api/labels for frame i: labels and detections, and the misses and
+        false positives at a minimum score."""
         truth = frame.truth()
         camera = frame.camera() if self.sources and truth is not None else None
-        detections = {name: source.find(i, frame) for name, source in self.sources.items()}
+        detections = {name: source.detect(i, frame) for name, source in self.sources.items()}
         matches = (
             {}
             if truth is None
@@ -77,17 +78,18 @@ class Results:
         return layers_to_json(truth, detections, matches)
 
     def bind_layers(self, drive: Drive) -> Callable[[int, float], dict[str, Any]]:
-        """Return layers() for the frames of a drive, as a function of (i, min_score)."""
-        return lambda i, min_score: self.layers(i, drive.frames[i], min_score)
+        """Return make_layers() for the frames of a drive, as a function of (i, min_score)."""
+        return lambda i, min_score: self.make_layers(i, drive.frames[i], min_score)
 
 
 def layers_to_json(
     truth: GroundTruth | None, detections: Mapping[str, Detections], matches: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Convert labels and detections to rows: box, class, and track id or score.
+    """Convert labels and detections to rows of a box, its class, and a track id or score.
 
-    detections: by source; their rows end with the probabilities by the detector's own
-        sources.
+    Args:
+        detections: Detections by source. Their rows end with the probabilities of the sources that
+            the detector combines.
     """
     labels = (
         []
@@ -116,50 +118,51 @@ def match_detections(
     camera: Camera | None = None,
     classes: frozenset[str] = frozenset(DETECTED),
 ) -> dict[str, list[int]]:
-    """Compare the detections of at least min_score with the labels.
+    """Match the detections with a score of at least min_score to the labels.
 
-    A hit reaches the relaxed BEV overlap of its class, or is a pedestrian with its centre within
-    1 m. Every label is hit, missed or ignored; every detection is a hit, false or ignored.
+    A match must reach the relaxed BEV overlap of its class, or for pedestrians a centre distance of at
+    most 1 m. Every label is matched, missed or ignored; every detection is a true positive, a false
+    positive or ignored.
 
     Args:
-        camera: detections outside its view are ignored, as labels end there.
-        classes: classes that the source can detect. Labels of other classes are ignored, and so are
-            similar objects, such as vans, and detections on them.
+        camera: Detections outside its view are ignored, because only objects in view are labelled.
+        classes: Classes that the source can detect. Labels of other classes are ignored, and so are
+            labels of similar objects, such as vans, and detections that match them.
 
     Returns:
         Indices: `missed` and `ignored_labels` of labels, `false` and `ignored` of detections.
     """
-    missed, false, hits = [], [], []
+    missed, false_positives, true_positives = [], [], []
     true_names = np.array([SIMILAR_CLASS[CLASSES[c]] for c in truth.class_ids], object)
     for name in classes & DETECTED.keys():
         labels = np.flatnonzero(true_names == name)
         rows = np.flatnonzero((detections.class_ids == CLASSES.index(name)) & (detections.scores >= min_score))
         boxes, label_boxes = detections.boxes[rows].astype(np.float64), truth.boxes[labels]
         overlaps = bev_iou(boxes, label_boxes)
-        hit = overlaps >= DETECTED[name].relaxed
+        can_match = overlaps >= DETECTED[name].relaxed
         if name == CLASSES[PEDESTRIAN]:
             distances = np.linalg.norm(boxes[:, None, :2] - label_boxes[None, :, :2], axis=2)
-            hit |= distances <= MAX_CENTRE_DISTANCE
-        i, j = assign_pairs(1.0 - overlaps, hit) if hit.size else (np.zeros(0, int), np.zeros(0, int))
-        own = truth.class_ids[labels] == CLASSES.index(name)
-        missed += labels[own & ~np.isin(np.arange(len(labels)), j)].tolist()
-        hits += rows[i[own[j]]].tolist()
-        wrong = np.delete(rows, i)
-        if camera is not None and len(wrong):
-            wrong = wrong[camera.in_view(detections.boxes[wrong, :3])]
-        false += wrong.tolist()
-    wanted = [CLASSES.index(name) for name in classes & DETECTED.keys()]
-    counted = np.flatnonzero(detections.scores >= min_score)
+            can_match |= distances <= MAX_CENTRE_DISTANCE
+        i, j = assign_pairs(1.0 - overlaps, can_match) if can_match.size else (np.zeros(0, int), np.zeros(0, int))
+        is_same_class = truth.class_ids[labels] == CLASSES.index(name)
+        missed += labels[is_same_class & ~np.isin(np.arange(len(labels)), j)].tolist()
+        true_positives += rows[i[is_same_class[j]]].tolist()
+        unmatched = np.delete(rows, i)
+        if camera is not None and len(unmatched):
+            unmatched = unmatched[camera.in_view(detections.boxes[unmatched, :3])]
+        false_positives += unmatched.tolist()
+    scored_classes = [CLASSES.index(name) for name in classes & DETECTED.keys()]
+    scored_rows = np.flatnonzero(detections.scores >= min_score)
     return {
         "missed": sorted(missed),
-        "false": sorted(false),
-        "ignored_labels": np.flatnonzero(~np.isin(truth.class_ids, wanted)).tolist(),
-        "ignored": np.setdiff1d(counted, [*hits, *false]).tolist(),
+        "false": sorted(false_positives),
+        "ignored_labels": np.flatnonzero(~np.isin(truth.class_ids, scored_classes)).tolist(),
+        "ignored": np.setdiff1d(scored_rows, [*true_positives, *false_positives]).tolist(),
     }
 
 
 def make_detector_source(detector: Detector) -> Source:
-    """Make a source that runs a detector on request and caches its detections."""
+    """Return a source that runs a detector on request and caches its detections."""
 
     @lru_cache(maxsize=MAX_CACHED_FRAMES)
     def detect(i: int, frame: Frame) -> Detections:
@@ -169,17 +172,17 @@ def make_detector_source(detector: Detector) -> Source:
 
 
 def make_file_source(folder: Path) -> Source:
-    """Make a source of KITTI result files, folder/NAME.txt, or of the folder of a `detect` run.
+    """Return a source that reads KITTI result files folder/NAME.txt, or the output folder of `detect`.
 
-    A frame without a file has no detections. Raises InputError for an invalid file.
+    A frame without a file has no detections. The source raises InputError for an invalid file.
     """
     if not folder.is_dir():
-        raise InputError(f"there is no folder {folder} with result files")
-    files = find_result_folder(folder)
+        raise InputError(f"result folder {folder} does not exist")
+    result_folder = find_result_folder(folder)
 
     @lru_cache(maxsize=MAX_CACHED_FRAMES)
     def read(i: int, frame: Frame) -> Detections:
-        path = files / f"{frame.name}.txt"
+        path = result_folder / f"{frame.name}.txt"
         if not path.exists():
             return Detections.none()
         rows = read_results(path, choose_calibration(frame)[0].lidar_to_camera)
@@ -189,7 +192,7 @@ def make_file_source(folder: Path) -> Source:
 
 
 def choose_points_topic(path: Path) -> str:
-    """Return the cloud topic of a bag to show: one with clusters, else that of choose_cloud_topic.
+    """Choose the cloud topic of a bag: one with clusters, otherwise the one that choose_cloud_topic() returns.
 
     Raises InputError if the choice is ambiguous.
     """
@@ -199,9 +202,9 @@ def choose_points_topic(path: Path) -> str:
 
 
 def read_recorded_results(poses: BagPoses, stamps: list[int]) -> Results:
-    """Read the detections and tracks of all nodes in a bag, by the stamps (ns) of the clouds.
+    """Read the detections and tracks of all nodes in a bag for clouds with these stamps (ns).
 
-    A topic whose boxes cannot be transformed to the clouds' frame is left out, with a warning.
+    A topic whose boxes cannot be transformed to the clouds' frame is skipped with a warning.
     """
     bag = poses.handle.bag()
     topics = {
@@ -222,19 +225,19 @@ def read_recorded_results(poses: BagPoses, stamps: list[int]) -> Results:
                 if stamp in index_by_stamp
             }
         except InputError as error:
-            errors.print(f"left out: {error}", style="yellow")
+            errors.print(f"skipped: {error}", style="yellow")
             continue
         if topic in trackers:
             tracks += tracks_to_json(frames, topic, trackers.index(topic))
         else:
-            sources[name_source(topic)] = _make_source(
+            sources[get_source_name(topic)] = _make_source(
                 {i: detections_with_sources(objects) for i, objects in frames.items()}
             )
     return Results(sources, tuple(tracks))
 
 
 def detections_with_sources(objects: MarkedObjects) -> Detections:
-    """Convert markers to detections, with the probabilities of sources that their text contains."""
+    """Convert markers to detections, with the probabilities by source that the markers' text contains."""
     probabilities = [e["sources"] if isinstance(e.get("sources"), dict) else {} for e in objects.extras]
     names = list(dict.fromkeys(name for row in probabilities for name in row))[:MAX_SOURCES]
     return replace(
@@ -249,9 +252,9 @@ def _to_probability(value: Any) -> float:
     return float(value) if isinstance(value, int | float) and 0 <= value <= 1 else np.nan
 
 
-def name_source(topic: str) -> str:
-    """Return the node's name, such as fused_detector for /fused_detector/output/detections."""
-    return topic.strip("/").removesuffix(DETECTIONS)
+def get_source_name(topic: str) -> str:
+    """Return the name of a topic's node, such as fused_detector for /fused_detector/output/detections."""
+    return topic.strip("/").removesuffix(FOUND)
 
 
 def _make_source(detections_by_frame: Mapping[int, Detections]) -> Source:
@@ -260,9 +263,9 @@ def _make_source(detections_by_frame: Mapping[int, Detections]) -> Source:
 
 
 def read_recorded_scan(frame: Frame) -> Scan:
-    """Return the scan of a bag's frame, with recorded ground and clusters if there are any.
+    """Return the scan of a frame in a bag, with recorded ground and clusters if the cloud contains them.
 
-    Raises InputError if it cannot be read.
+    Raises InputError if the cloud cannot be read.
     """
     message = frame.native()
     is_segmented = {"ground", "cluster_id"} <= {field.name for field in message.fields}
@@ -272,7 +275,7 @@ def read_recorded_scan(frame: Frame) -> Scan:
 def scan_from_message(message: Any, intensity_max: float = 0.0, scale: FullScale = infer_full_scale) -> Scan:
     """Convert a PointCloud2 to a scan, with ground and clusters if the cloud has these columns.
 
-    intensity_max, scale: see to_point_cloud. Raises InputError for an invalid message.
+    See to_point_cloud() for intensity_max and scale. Raises InputError if the message is invalid.
     """
     cloud, indices = to_point_cloud(message, intensity_max, scale)
     ground, clusters = read_column(message, "ground", indices), read_cluster_ids(message, indices)
@@ -284,14 +287,16 @@ def scan_from_message(message: Any, intensity_max: float = 0.0, scale: FullScale
 
 
 def make_track_id(tracker: int, number: int) -> int:
-    """Return the id of a track on the page, unique over all trackers; `tracker` counts from 0."""
+    """Return a track id that is unique over all trackers, from the tracker's index and its own track id."""
     return tracker * TRACKER_ID_STEP + number % TRACKER_ID_STEP
 
 
 def tracks_to_json(frames: Mapping[int, MarkedObjects], topic: str, tracker: int) -> list[dict[str, Any]]:
-    """Convert the messages of a tracker, by frame, to JSON objects of tracks.
+    """Convert the messages of a tracker to tracks, as JSON objects for the page.
 
-    tracker: see make_track_id.
+    Args:
+        frames: Message of each frame, by frame index.
+        tracker: Index of the tracker, see make_track_id().
     """
     tracks: dict[int, dict[str, Any]] = {}
     for i in sorted(frames):
@@ -309,7 +314,7 @@ def tracks_to_json(frames: Mapping[int, MarkedObjects], topic: str, tracker: int
                     "uncertainty": 0.0,
                 },
             )
-            track["class"] = label  # the tracker's latest decision
+            track["class"] = label  # the latest class counts
             track["score"] = max(track["score"], float(score))
             track["boxes"].append([i, *map(float, box), "proposed"])
     return list(tracks.values())

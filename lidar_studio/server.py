@@ -1,4 +1,4 @@
-"""HTTP server of the page, for this machine only; every request needs a token."""
+"""HTTP server of the page. It accepts only requests from this machine that contain a token."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from lidar_studio.state import find_next_uncertain
 LOG = logging.getLogger(__name__)
 HOSTS = ("127.0.0.1", "localhost")
 PAGE = Path(__file__).with_name("page")
-MAX_REQUEST = 10**7  # maximum size of a request in bytes
+MAX_REQUEST_BYTES = 10**7
 MAX_QUEUED_EVENTS = 1000
-PREFETCH_FRAMES = 2  # number of frames to prefetch on either side of the requested one
-Events = asyncio.Queue[dict[str, Any] | None]  # events of one page; None if the page is too far behind
+PREFETCH_FRAMES = 2  # frames to prefetch on each side of the requested one
+EventQueue = asyncio.Queue[dict[str, Any] | None]  # events for one page; None disconnects a page that is too slow
 HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -47,29 +47,30 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 @dataclass(eq=False)
 class PageContent:
-    """A drive with labels or results, or a running graph.
+    """Content of the page: a drive with labels or results, or a running graph.
 
-    session: None to view results without labelling.
-    layers: returns the JSON object of /api/labels for (i, min_score); None without labels and
-        detections.
-    tracks: returns the JSON objects of the tracks to view.
-    token: every request must contain it.
+    Attributes:
+        session: Labelling session, or None to view results without labelling.
+        make_layers: Function of (frame, min_score) that returns the JSON object of /api/labels, or None
+            if there are no labels and detections.
+        list_tracks: Function that returns the tracks to view, as JSON objects.
+        token: Secret that every request must contain.
     """
 
     drive: Drive | LiveGraph
     session: Session | None = None
-    layers: Callable[[int, float], dict[str, Any]] | None = None
-    tracks: Callable[[], Sequence[dict[str, Any]]] = tuple
+    make_layers: Callable[[int, float], dict[str, Any]] | None = None
+    list_tracks: Callable[[], Sequence[dict[str, Any]]] = tuple
     token: str = field(default_factory=partial(secrets.token_urlsafe, 24))
 
     @property
     def live(self) -> LiveGraph | None:
-        """The running graph, None for a drive."""
+        """The running graph, or None for a drive."""
         return self.drive if isinstance(self.drive, LiveGraph) else None
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON object of /api/drive."""
-        common = {
+        common_fields = {
             "name": self.drive.name,
             "mode": "label" if self.session else "view",
             "classes": list_classes(),
@@ -79,7 +80,7 @@ class PageContent:
         }
         if isinstance(self.drive, LiveGraph):
             return {
-                **common,
+                **common_fields,
                 "path": "",
                 "layout": "live",
                 "has": [],
@@ -98,7 +99,7 @@ class PageContent:
             for i, f in enumerate(self.drive.frames)
         ]
         return {
-            **common,
+            **common_fields,
             "path": str(self.drive.recording.path),
             "frames": frames,
             "layout": self.drive.recording.layout,
@@ -107,34 +108,34 @@ class PageContent:
 
 
 class Server:
-    """The web application."""
+    """The web application, with one handler per route."""
 
     def __init__(self, content: PageContent) -> None:
         self.content = content
         self.cloud_pool = ThreadPoolExecutor(2, "cloud")
-        self.action_pool = ThreadPoolExecutor(1, "action")  # one action at a time
-        self.pages: set[Events] = set()
-        self.prefetching: set[int] = set()
-        self.app = web.Application(middlewares=[self.check_request], client_max_size=MAX_REQUEST)
+        self.action_pool = ThreadPoolExecutor(1, "action")  # a single thread, because actions run in order
+        self.pages: set[EventQueue] = set()
+        self.prefetching_frames: set[int] = set()
+        self.app = web.Application(middlewares=[self.check_request], client_max_size=MAX_REQUEST_BYTES)
         self.app.add_routes(
             [
-                web.get("/", self.index),
-                web.get("/static/{name}", self.static),
-                web.get("/api/drive", self.drive),
-                web.get("/api/cloud/{i}", self.cloud),
-                web.get("/api/state", self.state),
-                web.post("/api/do", self.run_action),
-                web.get("/api/events", self.events),
-                web.get("/api/labels/{i}", self.labels),
-                web.get("/api/silhouettes", self.silhouettes),
-                web.get("/api/next", self.next),
-                web.post("/api/export", self.export),
+                web.get("/", self.send_page),
+                web.get("/static/{name}", self.send_static_file),
+                web.get("/api/drive", self.send_drive),
+                web.get("/api/cloud/{i}", self.send_cloud),
+                web.get("/api/state", self.send_state),
+                web.post("/api/do", self.execute_action),
+                web.get("/api/events", self.stream_events),
+                web.get("/api/labels/{i}", self.send_labels),
+                web.get("/api/silhouettes", self.send_silhouettes),
+                web.get("/api/next", self.send_next_track),
+                web.post("/api/export", self.export_labels),
             ]
         )
 
     @web.middleware
     async def check_request(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse requests from elsewhere, and convert exceptions to one-line errors."""
+        """Reject requests from other origins or without the token, and convert exceptions to one-line errors."""
         host = (request.host or "").rsplit(":", 1)[0]
         token = request.query.get("token") or request.cookies.get(_cookie_name(request)) or ""
         origin = request.headers.get("Origin")
@@ -142,7 +143,7 @@ class Server:
             return web.Response(status=403, text="this page is only available on this machine\n")
         if not hmac.compare_digest(token.encode(), self.content.token.encode()):
             return web.Response(
-                status=403, text="the token is wrong or missing; open the address that lidar-perception printed\n"
+                status=403, text="missing or wrong token; open the address that lidar-perception printed\n"
             )
         try:
             response = await handler(request)
@@ -150,88 +151,88 @@ class Server:
             response = _error_response(400, str(error))
         except web.HTTPException as error:
             response = _error_response(error.status, error.reason)
-        except Exception as error:  # a bug, but the journal still matches the labels
+        except Exception as error:  # a bug; the server can go on, because the journal still matches the labels
             LOG.exception("%s %s", request.method, request.path)
             response = _error_response(500, f"internal error: {type(error).__name__}: {shorten_error(error)}")
         if not response.prepared:
             response.headers.update(HEADERS)
         return response
 
-    async def index(self, request: web.Request) -> web.StreamResponse:
-        """Serve the page, and set the cookie for all further requests."""
+    async def send_page(self, request: web.Request) -> web.StreamResponse:
+        """Send the HTML page, with a cookie that contains the token for further requests."""
         response = web.FileResponse(PAGE / "index.html")
         response.set_cookie(_cookie_name(request), self.content.token, httponly=True, samesite="Strict", path="/")
         return response
 
-    async def static(self, request: web.Request) -> web.StreamResponse:
-        """Serve a file of the page."""
+    async def send_static_file(self, request: web.Request) -> web.StreamResponse:
+        """Send a file of the page."""
         name = request.match_info["name"]
         if name not in {p.name for p in PAGE.iterdir() if p.is_file()}:
             return _error_response(404, f"no such file: {name[:40]}")
         return web.FileResponse(PAGE / name)
 
-    async def drive(self, request: web.Request) -> web.StreamResponse:
-        """Describe the drive or graph."""
+    async def send_drive(self, request: web.Request) -> web.StreamResponse:
+        """Send a description of the drive or graph."""
         return web.json_response(self.content.to_json())
 
     def parse_frame(self, text: str) -> int:
-        """Parse the number of a frame. InputError if there is no such frame."""
+        """Parse a frame number, or raise InputError if there is no such frame."""
         first, end = self.content.drive.first, self.content.drive.end
         if not text.isascii() or not text.isdigit() or not first <= int(text[:9]) < end:
-            raise InputError(f"there is no frame {text[:20]}; there are {first} .. {end - 1}")
+            raise InputError(f"frame {text[:20]} does not exist; valid frames are {first} to {end - 1}")
         return int(text)
 
-    async def cloud(self, request: web.Request) -> web.StreamResponse:
-        """Send the points of a frame, and prefetch the frames around it."""
+    async def send_cloud(self, request: web.Request) -> web.StreamResponse:
+        """Send the points of a frame, and prefetch the neighbouring frames."""
         i, drive = self.parse_frame(request.match_info["i"]), self.content.drive
         load_scan = drive.load_scan
         body = await self.run_in_thread(lambda: load_scan(i).encode())
-        prefetched = 0 if self.content.live else PREFETCH_FRAMES
-        for neighbour in range(max(i - prefetched, drive.first), min(i + prefetched + 1, drive.end)):
-            if neighbour not in self.prefetching:
-                self.prefetching.add(neighbour)
+        margin = 0 if self.content.live else PREFETCH_FRAMES
+        for neighbour in range(max(i - margin, drive.first), min(i + margin + 1, drive.end)):
+            if neighbour not in self.prefetching_frames:
+                self.prefetching_frames.add(neighbour)
                 future = asyncio.get_running_loop().run_in_executor(self.cloud_pool, load_scan, neighbour)
                 future.add_done_callback(partial(self._finish_prefetch, neighbour))
         return web.Response(body=body, content_type="application/octet-stream")
 
     def _finish_prefetch(self, frame: int, future: asyncio.Future[Any]) -> None:
-        self.prefetching.discard(frame)
+        self.prefetching_frames.discard(frame)
         if not future.cancelled():
-            future.exception()  # marks it as retrieved; a request for the frame reports it
+            future.exception()  # avoids a warning; a request for the frame raises the exception again
 
     async def run_in_thread(self, function: Callable[[], Any]) -> Any:
-        """Run a function outside the event loop and return its result."""
+        """Run a function in a thread, so that it does not block the event loop, and return its result."""
         return await asyncio.get_running_loop().run_in_executor(self.cloud_pool, function)
 
     @property
     def session(self) -> Session:
-        """The labelling session. InputError if there is none."""
+        """The labelling session. Raises InputError in view mode."""
         if self.content.session is None:
-            raise InputError("view cannot change labels; start lidar-perception label")
+            raise InputError("labels cannot be changed in view mode; run lidar-perception label")
         return self.content.session
 
-    async def state(self, request: web.Request) -> web.StreamResponse:
+    async def send_state(self, request: web.Request) -> web.StreamResponse:
         """Send all labels, or the tracks of the results."""
         if self.content.session is None:
-            return web.json_response({"seq": 0, "tracks": list(self.content.tracks())})
+            return web.json_response({"seq": 0, "tracks": list(self.content.list_tracks())})
         return web.json_response(self.session.to_json())
 
-    async def run_action(self, request: web.Request) -> web.StreamResponse:
-        """Execute an action of a page, and send its number."""
+    async def execute_action(self, request: web.Request) -> web.StreamResponse:
+        """Execute an action sent by a page, and reply with its number."""
         action = await _read_json(request)
         page_id = request.headers.get("X-Page", "")[:64]
         loop = asyncio.get_running_loop()
-        seq = await loop.run_in_executor(self.action_pool, self.session.do, action, page_id)
+        seq = await loop.run_in_executor(self.action_pool, self.session.execute, action, page_id)
         return web.json_response({"seq": seq})
 
-    async def events(self, request: web.Request) -> web.StreamResponse:
-        """Stream the actions of all pages, or the frames of a running graph.
+    async def stream_events(self, request: web.Request) -> web.StreamResponse:
+        """Stream the actions of all pages, or the frames of a running graph, over a WebSocket.
 
-        No frames are added while a paused page is connected.
+        A running graph adds no frames while any connected page is paused.
         """
         socket = web.WebSocketResponse(heartbeat=20.0)
         await socket.prepare(request)
-        queue: Events = asyncio.Queue(MAX_QUEUED_EVENTS)
+        queue: EventQueue = asyncio.Queue(MAX_QUEUED_EVENTS)
         self.pages.add(queue)
         sender = asyncio.ensure_future(_send_events(socket, queue))
         try:
@@ -250,8 +251,7 @@ class Server:
         return socket
 
     def broadcast(self, event: dict[str, Any]) -> None:
-        """Queue an event for all pages. Disconnect pages that are too far behind, so that they
-        reload the state."""
+        """Queue an event for all pages. Pages with a full queue are disconnected, so that they reload the state."""
         for queue in list(self.pages):
             try:
                 queue.put_nowait(event)
@@ -260,16 +260,16 @@ class Server:
                 queue.get_nowait()
                 queue.put_nowait(None)
 
-    async def labels(self, request: web.Request) -> web.StreamResponse:
+    async def send_labels(self, request: web.Request) -> web.StreamResponse:
         """Send the labels and detections of a frame."""
-        i, layers = self.parse_frame(request.match_info["i"]), self.content.layers
-        if layers is None:
+        i, make_layers = self.parse_frame(request.match_info["i"]), self.content.make_layers
+        if make_layers is None:
             return web.json_response({"labels": [], "detections": {}, "matches": {}})
         score = request.query.get("score", "0")
         min_score = float(score) if re.fullmatch(r"[01](\.\d{1,9})?", score) else 0.0
-        return web.json_response(await self.run_in_thread(partial(layers, i, min_score)))
+        return web.json_response(await self.run_in_thread(partial(make_layers, i, min_score)))
 
-    async def silhouettes(self, request: web.Request) -> web.StreamResponse:
+    async def send_silhouettes(self, request: web.Request) -> web.StreamResponse:
         """Send the silhouettes of a track and of its most similar seed."""
         session = self.session
         track = require_track(session.state, _parse_number(request.query.get("track", "")))
@@ -281,17 +281,17 @@ class Server:
         except InputError as error:
             return _error_response(404, str(error))
 
-    async def next(self, request: web.Request) -> web.StreamResponse:
-        """Send the next uncertain track."""
+    async def send_next_track(self, request: web.Request) -> web.StreamResponse:
+        """Send the id of the next uncertain track, and the frame in which the object is nearest."""
         after, class_name = _parse_number(request.query.get("after", "")), request.query.get("class")
         track = find_next_uncertain(self.session.state, after, lambda track: class_name in (None, track.class_name))
         return web.json_response({"track": track and track.id, "frame": track.find_nearest_frame() if track else 0})
 
-    async def export(self, request: web.Request) -> web.StreamResponse:
-        """Write the labels in another format."""
+    async def export_labels(self, request: web.Request) -> web.StreamResponse:
+        """Export the labels to a file or folder."""
         options, session = await _read_json(request), self.session
         if not isinstance(options.get("format"), str) or not isinstance(options.get("out"), str):
-            raise InputError("an export needs `format`, and `out`, a file or folder")
+            raise InputError("an export requires `format` and `out` (a file or folder), both strings")
         return web.json_response(
             await self.run_in_thread(
                 partial(session.export, options["format"], options["out"], options.get("force") is True)
@@ -304,7 +304,7 @@ def _parse_number(text: str) -> int | None:
 
 
 def _cookie_name(request: web.Request) -> str:
-    """Return a name that contains the port, as all ports of a host share their cookies."""
+    """Return the name of the token's cookie. It contains the port, because servers on a host share cookies."""
     return f"token_{request.url.port}"
 
 
@@ -322,30 +322,30 @@ async def _read_json(request: web.Request) -> Mapping[str, Any]:
     return content
 
 
-async def _send_events(socket: web.WebSocketResponse, queue: Events) -> None:
+async def _send_events(socket: web.WebSocketResponse, queue: EventQueue) -> None:
     while not socket.closed and (event := await queue.get()) is not None:
         await socket.send_json(event)
     await socket.close()
 
 
 def _notify_in_loop(loop: asyncio.AbstractEventLoop, server: Server, event: dict[str, Any]) -> None:
-    with suppress(RuntimeError):  # the loop may be closed, because a source can outlive the server
+    with suppress(RuntimeError):  # the loop is closed if the session or graph outlives the server
         loop.call_soon_threadsafe(server.broadcast, event)
 
 
 async def serve(content: PageContent, port: int, on_start: Callable[[str], None]) -> None:
-    """Serve until SIGINT or SIGTERM.
+    """Serve the page until SIGINT or SIGTERM.
 
     Args:
-        port: 0 for any free port.
-        on_start: called with the address of the page.
+        port: Port to listen on, 0 for any free port.
+        on_start: Function called with the address of the page.
 
     Raises:
-        InputError: the port is in use.
+        InputError: The port is in use.
     """
-    server, loop, stop = Server(content), asyncio.get_running_loop(), asyncio.Event()
+    server, loop, stop_event = Server(content), asyncio.get_running_loop(), asyncio.Event()
     for signal_number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(signal_number, stop.set)
+        loop.add_signal_handler(signal_number, stop_event.set)
     for source in (content.session, content.live):
         if source is not None:
             source.listeners.append(partial(_notify_in_loop, loop, server))
@@ -357,12 +357,12 @@ async def serve(content: PageContent, port: int, on_start: Callable[[str], None]
     except OSError as error:
         await runner.cleanup()
         raise InputError(
-            f"cannot listen on port {port}: {error.strerror or error}; give another --port, or 0 for any"
+            f"cannot listen on port {port}: {error.strerror or error}; choose another --port, or 0 for any free port"
         ) from None
     address = runner.addresses[0]
     on_start(f"http://{HOSTS[0]}:{address[1]}/?token={content.token}")
     try:
-        await stop.wait()
+        await stop_event.wait()
     finally:
         server.pages.clear()
         await runner.cleanup()

@@ -1,4 +1,4 @@
-"""A labelling session: the labels of a drive, and the actions of its pages."""
+"""A labelling session: the labels of a drive, and the actions sent by its browser pages."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from lidar_studio.actions import (
 from lidar_studio.drive import Drive
 from lidar_studio.interpolation import Motion
 from lidar_studio.journal import Journal, open_journal
-from lidar_studio.label_conversion import compute_digest, join_extras, to_labels, to_tracks
+from lidar_studio.label_conversion import compute_digest, merge_preserved_fields, to_labels, to_tracks
 from lidar_studio.proposer import Proposer, merge_proposals
 from lidar_studio.snap import fit_clicked_box, snap_box
 from lidar_studio.state import (
@@ -52,19 +52,20 @@ from lidar_studio.state import (
 
 Array = np.ndarray[Any, Any]
 
-NEARBY_FRAMES = 20  # number of frames on each side of a click that are tracked immediately
+NEARBY_FRAMES = 20  # frames on each side of a click in which the object is tracked immediately
 Listener = Callable[[dict[str, Any]], None]
 
 
 class AlreadyImportedError(InputError):
-    """The journal already contains the same imported labels."""
+    """The same labels have already been imported into this journal."""
 
 
 class Session:
-    """A labelling session; thread-safe.
+    """Thread-safe labelling session.
 
-    listeners: called with every event of /api/events.
-    busy: progress of the background task, for the page; None without a task.
+    Attributes:
+        listeners: Functions called with every event of /api/events.
+        busy: Progress of the background task, or None if no task is running.
     """
 
     def __init__(self, drive: Drive, journal: Journal, detector: DetectorChoice | None = DetectorChoice()) -> None:
@@ -73,36 +74,38 @@ class Session:
         self.listeners: list[Listener] = []
         self.busy: dict[str, Any] | None = None
         self.has_proposals = any(line.get("do") == "propose" for line in journal.lines)
-        # Cancel events of the running task, and of the next one, which waits for it to end.
+        # Cancellation of the running task, and of the next task, which waits for the running one to end.
         self._cancelled = self._next_cancelled = threading.Event()
         self._worker: threading.Thread | None = None
         self._task = ""  # name of the worker's task, "" once it has ended
-        self._lock, self._exporting = threading.RLock(), threading.Lock()
+        self._lock, self._export_lock = threading.RLock(), threading.Lock()
         for line in journal.lines:
             self.state, _ = apply(self.state, convert_tracks(line, track_from_json), drive.motion)
         journal.lines.clear()
 
     @property
     def motion(self) -> Motion:
-        """Times of the frames, and sensor poses if known."""
+        """Times of the frames, and the sensor poses if they are known."""
         return with_scan_poses(self.state, self.drive.motion)
 
-    def do(self, action: Mapping[str, Any], page_id: str = "") -> int:
-        """Execute an action of a page and return its number.
+    def execute(self, action: Mapping[str, Any], page_id: str = "") -> int:
+        """Execute an action sent by a page and return its number.
 
         Raises:
-            InputError: the action is invalid or cannot be written; the labels are unchanged.
+            InputError: The action is invalid or cannot be saved. The labels are unchanged.
         """
         if action.get("do") in ("propose", "cancel"):
             return self.start_proposals(page_id, True) if action["do"] == "propose" else self.cancel()
         with self._lock:
-            seq = self._record(self._complete(strip_computed(action)), page_id)
+            seq = self._record(self._add_computed_fields(strip_computed(action)), page_id)
             name = action.get("do")
-            # Undo may restore a track from before its tracking ended, and rejected clicks are not
-            # tracked. So a click may have to be tracked after these actions.
-            resumes = name in ("undo", "redo", "accept", "reopen") and not self._task
-            if (name == "seed" or resumes) and self._has_waiting_clicks():
-                self._start("following", lambda: self._track_clicks(page_id, None if resumes else seq))
+            # Undo may restore a clicked track that was not fully tracked yet, and rejected tracks are not
+            # tracked at all. So these actions may leave a clicked object that still has to be tracked.
+            restores_tracks = name in ("undo", "redo", "accept", "reopen") and not self._task
+            if (name == "seed" or restores_tracks) and self._has_waiting_clicks():
+                self._start(
+                    "tracking clicked objects", lambda: self._track_clicks(page_id, None if restores_tracks else seq)
+                )
         return seq
 
     def cancel(self) -> int:
@@ -115,24 +118,25 @@ class Session:
         """Survey the drive in the background, and propose tracks if there are no proposals yet.
 
         Args:
-            again: a person requested new proposals.
+            again: True if a person requested new proposals.
 
         Returns:
             The number of the last action.
 
         Raises:
-            InputError: proposals are already being made.
+            InputError: Proposals are already being computed.
         """
         with self._lock:
-            if self._task == "proposing":
-                raise InputError("proposals are already being made")
+            if self._task == "proposing tracks":
+                raise InputError("proposals are already being computed; wait until they are finished, or cancel them")
             self._start(
-                "proposing", lambda: self.propose(page_id, again=again or not self.has_proposals, by_person=again)
+                "proposing tracks",
+                lambda: self.propose(page_id, again=again or not self.has_proposals, by_person=again),
             )
         return self.state.seq
 
     def _start(self, task: str, run_task: Callable[[], None]) -> None:
-        """Cancel the previous task and run a new one in a thread."""
+        """Cancel the previous task and run a new task in a thread."""
         self.cancel()
         previous, cancelled, self._task = self._worker, threading.Event(), task
         self._next_cancelled = cancelled
@@ -144,10 +148,10 @@ class Session:
             self._cancelled = cancelled  # may already be set
             try:
                 run_task()
-            except Exception as error:  # shown on the page, because nobody joins this thread
-                is_known = isinstance(error, InputError)
-                reason = f"no proposals: {type(error).__name__}: {shorten_error(error)}"
-                self.notify({"error": str(error) if is_known else reason})
+            except InputError as error:
+                self.notify({"error": str(error)})
+            except Exception as error:  # show it on the page, because nobody joins this thread
+                self.notify({"error": f"cannot compute proposals: {type(error).__name__}: {shorten_error(error)}"})
             finally:
                 self.busy = None
                 with self._lock:
@@ -164,14 +168,14 @@ class Session:
             self._worker.join()
 
     def propose(self, page_id: str = "", again: bool = True, by_person: bool = False) -> None:
-        """Survey the drive if necessary, and record proposals unless cancelled.
+        """Survey the drive if necessary, and record proposals unless the task is cancelled.
 
         Args:
-            again: if False, make proposals only when a click has not been tracked yet.
-            by_person: a person requested the proposals and can undo them.
+            again: If False, compute proposals only if a clicked object still has to be tracked.
+            by_person: True if a person requested the proposals and can undo them.
 
         Raises:
-            InputError: a frame or the weights cannot be read.
+            InputError: A frame or the weights cannot be read.
         """
         self.proposer.load_cached()
         self._report_problem()
@@ -192,17 +196,17 @@ class Session:
             self.proposer.problem = ""
 
     def _report_progress(self, count: int) -> bool:
-        """Report the number of finished frames. Return False to cancel the task."""
+        """Report the number of finished frames; return False if the task has been cancelled."""
         if self.busy is not None:
             self.busy = {**self.busy, "done": count}
             self.notify({"progress": self.get_progress()})
         return not self._cancelled.is_set()
 
     def _propose_all(self, page_id: str, seed: int | None, by_person: bool = False) -> None:
-        """Make proposals for the whole drive and record them.
+        """Compute proposals for the whole drive and record them.
 
-        Other actions may be recorded in the meantime. If the last action is still number `seed`,
-        the proposals become part of it.
+        Other actions may be recorded in the meantime. If the last action is still number `seed`, the
+        proposals become part of that action, so that both are undone together.
         """
         state = self.state
         proposals = self.proposer.make_proposals(state, self.motion, None, self._report_progress)
@@ -210,30 +214,30 @@ class Session:
             if proposals is None or self._cancelled.is_set() or (seed is not None and not self._has_waiting_clicks()):
                 return
             tracks, removed = merge_proposals(self.state, proposals, self.motion)
-            # Undoing a seed also undoes its proposals, but never the first proposals of a drive.
-            joins = seed == self.state.seq and self.has_proposals
-            undo = {} if by_person else {"joins": True} if joins else {"beside": True}
-            self._record({"do": "propose", "tracks": tracks, "removed": removed, **undo}, page_id)
+            # Undoing a click also undoes its proposals, but never the first proposals of a drive.
+            belongs_to_seed = seed == self.state.seq and self.has_proposals
+            undo_mode = {} if by_person else {"joins": True} if belongs_to_seed else {"beside": True}
+            self._record({"do": "propose", "tracks": tracks, "removed": removed, **undo_mode}, page_id)
             self.has_proposals = True
 
     def _track_clicks(self, page_id: str, seed: int | None) -> None:
         with self._lock:
-            waiting = self._has_waiting_clicks()
-        if waiting:
+            has_waiting_clicks = self._has_waiting_clicks()
+        if has_waiting_clicks:
             self._propose_all(page_id, seed)
 
     def _has_waiting_clicks(self) -> bool:
-        return any(t.nearby and t.awaits_tracking for t in self.state.tracks.values())
+        return any(t.is_partly_tracked and t.awaits_tracking for t in self.state.tracks.values())
 
-    def _complete(self, action: Action) -> Action:
-        """Add the computed fields to an action."""
+    def _add_computed_fields(self, action: Action) -> Action:
+        """Return an action with the fields that the server computes."""
         name = action.get("do")
         if name == "seed":
-            return self._complete_seed(action)
+            return self._add_seed_tracks(action)
         if name == "snap":
             return {**action, "box": round_box(snap_box(action, self.state, self.drive))}
         if name == "import":
-            return self._complete_import(action)
+            return self._add_imported_tracks(action)
         if name in ("accept", "reopen"):
             track = require_track(self.state, action.get("track"))
             was_seed = track.source == CLICK and track.state == REJECTED
@@ -241,54 +245,52 @@ class Session:
                 return {**action, "seed": track.find_nearest_frame()}
         return action
 
-    def _complete_import(self, action: Action) -> Action:
+    def _add_imported_tracks(self, action: Action) -> Action:
         path, name = action.get("path"), action.get("format") or ""
         if not isinstance(path, str) or not isinstance(name, str):
-            raise InputError("an import needs the path of a label file or folder, and optionally a format, as text")
+            raise InputError(
+                "an import requires `path` (a label file or folder); `format` is optional; both are strings"
+            )
         labels = import_labels(Path(path), name or recognise_format(Path(path)), self.drive.frames)
-        tracks, preserved = to_tracks(labels, self.state.next_id)
-        earlier = self.state.preserved
-        digest, imports = compute_digest(tracks, preserved), earlier.get("imports", [])
+        tracks, new_fields = to_tracks(labels, self.state.next_id)
+        old_fields = self.state.preserved_fields
+        digest, imports = compute_digest(tracks, new_fields), old_fields.get("imports", [])
         if digest in imports:
-            raise AlreadyImportedError(f"the labels in {path} were already imported; nothing was done")
-        return {**action, "tracks": tracks, "kept": {**join_extras(earlier, preserved), "imports": [*imports, digest]}}
+            raise AlreadyImportedError(f"the labels in {path} were already imported; nothing was changed")
+        preserved_fields = {**merge_preserved_fields(old_fields, new_fields), "imports": [*imports, digest]}
+        return {**action, "tracks": tracks, "kept": preserved_fields}
 
     def export(self, format_name: str, out: str, force: bool = False) -> dict[str, Any]:
         """Export the accepted tracks.
 
         Args:
-            format_name: a key of exchange.FORMATS.
-            out: path, relative to the journal's folder.
-            force: replace existing files.
+            format_name: Key of exchange.FORMATS.
+            out: Output path, relative to the journal's folder.
+            force: True to replace existing files.
 
         Returns:
-            The JSON object of /api/export: path, boxes, frames, left_out.
+            The JSON object of /api/export with path, boxes, frames and left_out.
 
         Raises:
-            InputError: the labels cannot be written there.
+            InputError: The labels cannot be written to this path.
         """
         path = Path(out).expanduser()
         if not out or ".." in path.parts:
-            raise InputError(f"{out!r} is not a valid name for an export; give one without '..'")
+            raise InputError(f"invalid export path {out!r}: it must not be empty or contain '..'")
         path = self.journal.path.parent / path
         if path.resolve() == self.journal.path.resolve():
-            raise InputError(f"{path} is the journal of these labels; give another name")
-        with self._exporting:  # the user may press the button twice
-            written = export_labels(
+            raise InputError(f"cannot export to {path}: this is the journal of these labels; choose another name")
+        with self._export_lock:  # the user may press the button twice
+            result = export_labels(
                 to_labels(self.state, self.drive.frames), format_name, path, self.drive.frames, force
             )
-        nearby = [t.id for t in self.state.tracks.values() if t.nearby and t.awaits_tracking]
-        return {
-            "path": str(written.path),
-            "boxes": written.boxes,
-            "frames": written.frames,
-            "left_out": [
-                *written.left_out,
-                *([f"later boxes of tracks that are still being tracked: {nearby}"] if nearby else []),
-            ],
-        }
+        partial_ids = [t.id for t in self.state.tracks.values() if t.is_partly_tracked and t.awaits_tracking]
+        left_out = [*result.left_out]
+        if partial_ids:
+            left_out.append(f"boxes far from the click of tracks that are still being computed: {partial_ids}")
+        return {"path": str(result.path), "boxes": result.boxes, "frames": result.frames, "left_out": left_out}
 
-    def _complete_seed(self, action: Action) -> Action:
+    def _add_seed_tracks(self, action: Action) -> Action:
         frame, class_name = require_frame(action, self.drive.motion), require_class_name(action)
         click = np.array(require_numbers(action, "xyz", 3))
         box = fit_clicked_box(self.drive.load_scan(frame), click, class_name)
@@ -304,19 +306,19 @@ class Session:
             next_id=track.id + 1,
         )
         count = len(self.drive.frames)
-        nearby = range(max(frame - NEARBY_FRAMES, 0), min(frame + NEARBY_FRAMES + 1, count))
+        nearby_frames = range(max(frame - NEARBY_FRAMES, 0), min(frame + NEARBY_FRAMES + 1, count))
         is_long = count > 2 * NEARBY_FRAMES
-        proposals = self.proposer.make_proposals(state, self.motion, nearby if is_long else None)
+        proposals = self.proposer.make_proposals(state, self.motion, nearby_frames if is_long else None)
         tracks, removed = merge_proposals(state, proposals or [], self.motion)
         if is_long:  # proposals in nearby frames must not replace tracks of the whole drive
             tracks = [t for t in tracks if t.id == track.id or t.id not in state.tracks]
             removed = []
-        clicked = next((t for t in tracks if t.id == track.id), track)
-        tracks = [t for t in tracks if t is not clicked] + [replace(clicked, nearby=is_long)]
+        clicked_track = next((t for t in tracks if t.id == track.id), track)
+        tracks = [t for t in tracks if t is not clicked_track] + [replace(clicked_track, is_partly_tracked=is_long)]
         return {**action, "tracks": tracks, "removed": removed}
 
     def _record(self, action: Action, page_id: str) -> int:
-        """Apply an action, write it to the journal, and notify the listeners."""
+        """Apply an action, write it to the journal, notify the listeners, and return its number."""
         new_state, change = apply(self.state, action, self.drive.motion)
         encoded: dict[int, dict[str, Any]] = {}
 
@@ -347,14 +349,14 @@ class Session:
             listener(event)
 
     def get_progress(self) -> dict[str, Any]:
-        """Return counts of tracks and frames, and the progress of the background task."""
+        """Return the numbers of tracks and frames, and the progress of the background task."""
         return {**count_progress(self.state, len(self.drive.frames)), "busy": self.busy}
 
     def summarize(self) -> dict[str, Any]:
-        """Return the part of the state that every event contains: all but the tracks."""
+        """Return the part of the state that every event contains, which is all but the tracks."""
         state = self.state
         return {
-            "checked": sorted(state.checked),
+            "checked": sorted(state.checked_frames),
             "seeds": [list(s) for s in state.seeds],
             "can_undo": state.undo_stack is not None,
             "can_redo": state.redo_stack is not None,
@@ -373,10 +375,10 @@ class Session:
 
 @contextmanager
 def open_session(drive: Drive, folder: Path, detector: DetectorChoice | None = DetectorChoice()) -> Iterator[Session]:
-    """Open the labels of a drive that are stored in a folder, or start new ones.
+    """Open the labelling session stored in a folder, or start a new one.
 
     Raises:
-        InputError: the journal belongs to another drive, or another process uses it.
+        InputError: The journal belongs to another drive, or another process uses it.
     """
     with open_journal(folder, drive.journal_header) as journal:
         session = Session(drive, journal, detector)

@@ -1,4 +1,4 @@
-"""Immutable state of a labelling session: tracks of boxes, seeds, checked frames, undo history.
+"""Immutable state of a labelling session: tracks, seeds, checked frames and undo history.
 
 Boxes are in the LiDAR frame of their scan. actions.py computes the next state.
 """
@@ -12,32 +12,33 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-KEY, PROPOSED, INTERPOLATED = "key", "proposed", "interpolated"  # kinds of boxes
-ACCEPTED, REJECTED = "accepted", "rejected"  # states of tracks, in addition to PROPOSED
-CLICK = "click"  # source of a clicked track, which is then tracked through the drive
+KEY, PROPOSED, INTERPOLATED = "key", "proposed", "interpolated"  # box kinds
+ACCEPTED, REJECTED = "accepted", "rejected"  # track states, in addition to PROPOSED
+CLICK = "click"  # track source: a person clicked the object, which is then tracked through the drive
 
 
 class Box(NamedTuple):
-    """[x y z l w h yaw]; KEY (set by a person), PROPOSED or INTERPOLATED (between key boxes)."""
+    """A box [x y z l w h yaw] and its kind: KEY (set by a person), PROPOSED or INTERPOLATED."""
 
     values: tuple[float, ...]
     kind: str
 
     @staticmethod
-    def of(values: np.ndarray[Any, Any], kind: str) -> Box:
+    def from_array(values: np.ndarray[Any, Any], kind: str) -> Box:
         """Make a box from an array (7,) float64."""
         return Box(tuple(values.tolist()), kind)
 
 
 @dataclass(frozen=True)
 class Track:
-    """One object over the frames of a drive.
+    """An object and its boxes in the frames of a drive.
 
-    boxes: by frame.
-    removed_frames: frames from which a person removed the box.
-    extra: by frame, fields of an imported label that are preserved for export.
-    edited: a person changed the class, or split or merged the track.
-    nearby: a clicked track that so far has boxes only in the frames around the click.
+    Attributes:
+        boxes: Box of each frame in which the object has one.
+        removed_frames: Frames from which a person removed the box.
+        extra: Fields of an imported label to preserve for export, by frame.
+        is_edited: True if a person changed the class, or split or merged the track.
+        is_partly_tracked: True if a clicked object has only been tracked in the frames around the click.
     """
 
     id: int
@@ -48,15 +49,15 @@ class Track:
     boxes: Mapping[int, Box] = field(default_factory=dict)
     removed_frames: frozenset[int] = frozenset()
     extra: Mapping[int, Any] = field(default_factory=dict)
-    edited: bool = False
-    nearby: bool = False
+    is_edited: bool = False
+    is_partly_tracked: bool = False
 
     @property
     def has_human_edits(self) -> bool:
         """True if a person accepted, rejected or changed the track."""
         return (
             self.state != PROPOSED
-            or self.edited
+            or self.is_edited
             or bool(self.removed_frames)
             or any(box.kind == KEY for box in self.boxes.values())
         )
@@ -67,31 +68,33 @@ class Track:
         return (
             self.source == CLICK
             and self.state != REJECTED
-            and not self.edited
-            and (len(self.boxes) == 1 or self.nearby)
+            and not self.is_edited
+            and (len(self.boxes) == 1 or self.is_partly_tracked)
         )
 
     @property
     def uncertainty(self) -> float:
-        """Uncertainty of the score: 1 at 0.5, falling to 0 at 0 and 1."""
+        """Uncertainty of the score: 1 at a score of 0.5, falling linearly to 0 at scores of 0 and 1."""
         return 1.0 - 2.0 * abs(self.score - 0.5)
 
     def find_nearest_frame(self) -> int:
-        """Return the frame in which the object is nearest to the sensor; 0 without boxes."""
+        """Return the frame in which the object is nearest to the sensor, or 0 if the track has no boxes."""
         return min(self.boxes, key=lambda f: (math.hypot(*self.boxes[f].values[:2]), f), default=0)
 
 
 class Change(NamedTuple):
-    """Values before and after an action: tracks by id (None if absent), seeds, checked frames, and
-    the preserved fields of imported files."""
+    """Changes made by an action, as pairs of the values before and after it.
+
+    A track is None where it does not exist.
+    """
 
     tracks: Mapping[int, tuple[Track | None, Track | None]]
     seeds: tuple[Seeds, Seeds]
-    checked: tuple[frozenset[int], frozenset[int]]
-    preserved: tuple[PreservedFields, PreservedFields]
+    checked_frames: tuple[frozenset[int], frozenset[int]]
+    preserved_fields: tuple[PreservedFields, PreservedFields]
 
     def combine_with(self, later: Change) -> Change:
-        """Return this change and a later one as a single change."""
+        """Return a single change with the effect of this change followed by `later`."""
         tracks = {
             n: (self.tracks[n] if n in self.tracks else later.tracks[n])[:1]
             + (later.tracks[n] if n in later.tracks else self.tracks[n])[1:]
@@ -100,8 +103,8 @@ class Change(NamedTuple):
         return Change(
             tracks,
             (self.seeds[0], later.seeds[1]),
-            (self.checked[0], later.checked[1]),
-            (self.preserved[0], later.preserved[1]),
+            (self.checked_frames[0], later.checked_frames[1]),
+            (self.preserved_fields[0], later.preserved_fields[1]),
         )
 
     def invert(self) -> Change:
@@ -109,38 +112,38 @@ class Change(NamedTuple):
         return Change(
             {k: (after, before) for k, (before, after) in self.tracks.items()},
             self.seeds[::-1],
-            self.checked[::-1],
-            self.preserved[::-1],
+            self.checked_frames[::-1],
+            self.preserved_fields[::-1],
         )
 
 
 Seeds = tuple[tuple[int, int], ...]  # (frame, track id)
-PreservedFields = Mapping[str, Any]  # preserved fields of imported files, see label_conversion.py
-Stack = tuple[Change, Any] | None  # a change, and the stack below it: shared between states
+PreservedFields = Mapping[str, Any]  # fields of imported files to preserve for export, see label_conversion.py
+Stack = tuple[Change, Any] | None  # linked list: a change and the stack below it, shared between states
 
 
 @dataclass(frozen=True)
 class State:
-    """The labels after an action.
+    """Labels after an action.
 
-    seq: number of that action.
-    next_id: id of the next new track.
-    preserved: preserved fields of imported files.
-    poses: (F, 16) sensor poses from scan matching, if the recording has none.
+    Attributes:
+        seq: Number of the action.
+        next_id: Id for the next new track.
+        poses: (F, 16) sensor poses from scan matching; empty if the recording has poses.
     """
 
     tracks: Mapping[int, Track] = field(default_factory=dict)
     seeds: Seeds = ()
-    checked: frozenset[int] = frozenset()
+    checked_frames: frozenset[int] = frozenset()
     seq: int = 0
     next_id: int = 1
-    preserved: PreservedFields = field(default_factory=dict)
+    preserved_fields: PreservedFields = field(default_factory=dict)
     poses: tuple[tuple[float, ...], ...] = ()
     undo_stack: Stack = None
     redo_stack: Stack = None
 
     def with_change(self, change: Change) -> State:
-        """Return the state after a change, with the same undo and redo stacks."""
+        """Return the state after a change, with unchanged undo and redo stacks."""
         tracks = dict(self.tracks)
         for number, (_, track) in change.tracks.items():
             if track is None:
@@ -151,14 +154,14 @@ class State:
             self,
             tracks=tracks,
             seeds=change.seeds[1],
-            checked=change.checked[1],
-            preserved=change.preserved[1],
+            checked_frames=change.checked_frames[1],
+            preserved_fields=change.preserved_fields[1],
             next_id=max(self.next_id, *(n + 1 for n in change.tracks), 1),
         )
 
 
 def track_to_json(track: Track) -> dict[str, Any]:
-    """Convert a track to the JSON object of the page and the journal."""
+    """Convert a track to the JSON object used by the page and the journal."""
     content = {
         "id": track.id,
         "class": track.class_name,
@@ -172,11 +175,12 @@ def track_to_json(track: Track) -> dict[str, Any]:
         content["gone"] = sorted(track.removed_frames)
     if track.extra:
         content["extra"] = {str(f): track.extra[f] for f in sorted(track.extra)}
-    return content | {name: True for name in ("edited", "nearby") if getattr(track, name)}
+    flags = {"edited": track.is_edited, "nearby": track.is_partly_tracked}
+    return content | {name: True for name, is_set in flags.items() if is_set}
 
 
 def track_from_json(content: Mapping[str, Any]) -> Track:
-    """Make a track from the object of track_to_json."""
+    """Make a track from a JSON object made by track_to_json()."""
     boxes = {int(f): Box(tuple(map(float, values)), kind) for f, *values, kind in content["boxes"]}
     return Track(
         int(content["id"]),
@@ -195,9 +199,10 @@ def track_from_json(content: Mapping[str, Any]) -> Track:
 def find_next_uncertain(
     state: State, after: int | None = None, condition: Callable[[Track], bool] = lambda track: True
 ) -> Track | None:
-    """Return the most uncertain proposed track that meets a condition, or None.
+    """Return the next proposed track that meets a condition, most uncertain first, or None.
 
-    after: id of a track; the next one in this order is returned, or the first one after the last.
+    Args:
+        after: Id of the current track. The search continues behind it and wraps around.
     """
     candidates = sorted(
         (t for t in state.tracks.values() if t.state == PROPOSED and condition(t)), key=lambda t: (-t.uncertainty, t.id)
@@ -209,7 +214,7 @@ def find_next_uncertain(
 
 
 def count_progress(state: State, frames: int) -> dict[str, int]:
-    """Count tracks by state, checked frames and actions, for the page."""
+    """Count the tracks by state, the checked frames and the actions."""
     states = [t.state for t in state.tracks.values()]
     accepted, rejected = states.count(ACCEPTED), states.count(REJECTED)
     return {
@@ -218,6 +223,6 @@ def count_progress(state: State, frames: int) -> dict[str, int]:
         "rejected": rejected,
         "left": len(states) - accepted - rejected,
         "frames": frames,
-        "checked": len(state.checked),
+        "checked": len(state.checked_frames),
         "actions": state.seq,
     }

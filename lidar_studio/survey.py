@@ -1,6 +1,6 @@
 """Survey of a drive: detections and candidate clusters of every frame.
 
-It is computed once per drive; a new seed is then only compared with the clusters.
+It is computed once per drive. A new seed then only has to be compared with these clusters.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from lidar_perception.types import Detections
 from lidar_studio.drive import Drive, make_pipeline_params, select_drive
 
 Array = np.ndarray[Any, Any]
-MIN_DETECTION_SCORE = 0.1  # low, because the tracker filters weak detections
-PERSON_HEIGHTS_M = 0.9, 2.4  # height limits of a person above the ground
-MAX_PERSON_WIDTH_M = 2.0  # maximum BEV diagonal of the cluster
+MIN_DETECTION_SCORE = 0.1  # low, because the tracker filters uncertain detections
+PERSON_HEIGHTS_M = 0.9, 2.4  # minimum and maximum height of a person
+MAX_PERSON_DIAGONAL_M = 2.0  # maximum BEV diagonal of a person's cluster
 MIN_PERSON_POINTS = 5
-OBJECT_HEIGHTS_M = 0.7, 4.5  # height limits above the ground
-MAX_OBJECT_LENGTH_M = 14.0  # maximum BEV diagonal of the cluster
+OBJECT_HEIGHTS_M = 0.7, 4.5  # minimum and maximum height of other objects
+MAX_OBJECT_DIAGONAL_M = 14.0  # maximum BEV diagonal of another object's cluster
 MIN_OBJECT_POINTS = 10
 
 
@@ -42,11 +42,12 @@ MIN_OBJECT_POINTS = 10
 class FrameSurvey:
     """Survey of one frame.
 
-    boxes: (C, 7) of clusters that may be people, down to the ground.
-    images: (C, 80) uint32, silhouettes of these clusters.
-    features: (C,) each, by name; empty for C = 0.
-    shapes: (T, 7) L-shapes of clusters of object size, down to the ground.
-    pose: (4, 4) relative to the first frame, from scan matching; None if the drive has poses.
+    Attributes:
+        boxes: (C, 7) boxes of clusters that may be people, extended down to the ground.
+        images: (C, 80) uint32 silhouettes of these clusters.
+        features: Features (C,) of these clusters by name; empty if C is 0.
+        shapes: (T, 7) L-shapes of clusters that may be other objects, extended down to the ground.
+        pose: (4, 4) pose from scan matching, relative to the first frame; None if the drive has poses.
     """
 
     detections: Detections
@@ -62,17 +63,17 @@ def survey_frame(frame: Frame, detector: Detector | None = None, odometry: Odome
 
     Args:
         detector: None for no detections.
-        odometry: gives the pose; it needs all frames in order. None for no pose.
+        odometry: Scan matching, which must be given all frames in order; None for no pose.
 
     Raises:
-        InputError: the frame cannot be read.
+        InputError: The frame cannot be read.
     """
     cloud, params = frame.load(), make_pipeline_params(frame)
     segmented = segment_cloud(cloud, None, params)
     detections = Detections.none() if detector is None else detector(cloud).detections
     pose = None if odometry is None else odometry(cloud.xyz)
     counts = np.bincount(segmented.cluster_ids, minlength=len(segmented.boxes) + 1)[1:]
-    people = _find_clusters(segmented.boxes, counts, PERSON_HEIGHTS_M, MAX_PERSON_WIDTH_M, MIN_PERSON_POINTS)
+    people = _find_clusters(segmented.boxes, counts, PERSON_HEIGHTS_M, MAX_PERSON_DIAGONAL_M, MIN_PERSON_POINTS)
     boxes, shapes = segmented.boxes[people], _fit_objects(segmented, counts)
     if len(people) == 0:
         return FrameSurvey(detections, boxes, np.zeros((0, ROWS), np.uint32), {}, shapes, pose)
@@ -83,7 +84,7 @@ def survey_frame(frame: Frame, detector: Detector | None = None, odometry: Odome
 def _find_clusters(
     boxes: Array, counts: Array, heights: tuple[float, float], max_diagonal: float, min_points: int
 ) -> Array:
-    """Return the indices (K,) int of clusters within these limits."""
+    """Return the indices (K,) int of the clusters within these limits."""
     return np.flatnonzero(
         (boxes[:, 5] >= heights[0])
         & (boxes[:, 5] <= heights[1])
@@ -93,8 +94,8 @@ def _find_clusters(
 
 
 def _fit_objects(segmented: SegmentedCloud, counts: Array) -> Array:
-    """Fit the L-shapes (T, 7) float32 of clusters of object size."""
-    indices = _find_clusters(segmented.boxes, counts, OBJECT_HEIGHTS_M, MAX_OBJECT_LENGTH_M, MIN_OBJECT_POINTS)
+    """Fit L-shapes (T, 7) float32 to clusters that may be objects."""
+    indices = _find_clusters(segmented.boxes, counts, OBJECT_HEIGHTS_M, MAX_OBJECT_DIAGONAL_M, MIN_OBJECT_POINTS)
     numbers = np.zeros(len(segmented.boxes) + 1, np.int32)
     numbers[indices + 1] = np.arange(1, len(indices) + 1)
     labels = numbers[segmented.cluster_ids]
@@ -107,8 +108,8 @@ def _describe_people(
     xyz: Array, cluster_ids: Array, boxes: Array, numbers: Array, params: PipelineParams
 ) -> tuple[Array, dict[str, Array]]:
     points, start = group_points(xyz, cluster_ids, numbers)
-    floors = (boxes[:, 2] - boxes[:, 5] / 2).astype(np.float64)
-    images = draw_silhouettes(points, start, np.ones((len(boxes), 1)), floors, params)
+    ground_heights = (boxes[:, 2] - boxes[:, 5] / 2).astype(np.float64)
+    images = draw_silhouettes(points, start, np.ones((len(boxes), 1)), ground_heights, params)
     return images, compute_shape_features(points, start, boxes, params)
 
 
@@ -118,10 +119,10 @@ def survey_drive(
     """Yield the surveys of all frames from `first` on, in order.
 
     The frames are surveyed in a separate process if the recording can be reopened there. Scan
-    matching has to read earlier frames again; None is yielded for these.
+    matching must process earlier frames again, for which this function yields None.
 
     Raises:
-        InputError: a frame or the detector's weights cannot be read.
+        InputError: A frame or the detector's weights cannot be read.
     """
     reopen = drive.recording.reopen
     frames = list(range(0 if _needs_odometry(drive) else first, len(drive.frames)))
@@ -129,8 +130,8 @@ def survey_drive(
         yield from map(_make_surveyor(drive, choice, first), frames)
         return
     sequence = drive.frames[0].sequence
-    start = partial(_make_process_surveyor, reopen, choice, sequence, first)
-    yield from run_in_processes(start, frames, 1, "surveyed frames", separate=True)
+    make_surveyor = partial(_make_process_surveyor, reopen, choice, sequence, first)
+    yield from run_in_processes(make_surveyor, frames, 1, "surveyed frames", separate=True)
 
 
 def _needs_odometry(drive: Drive) -> bool:
@@ -158,5 +159,5 @@ def _make_surveyor(drive: Drive, choice: DetectorChoice | None, first: int) -> C
 def _make_process_surveyor(
     reopen: Callable[[], Recording], choice: DetectorChoice | None, sequence: str, first: int
 ) -> Callable[[int], FrameSurvey | None]:
-    os.nice(10)  # so that the page stays responsive
+    os.nice(10)  # keep the page responsive
     return _make_surveyor(select_drive(reopen(), sequence), choice, first)

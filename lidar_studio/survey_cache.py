@@ -1,4 +1,4 @@
-"""Cache of the survey of a drive on disk, for a restarted server."""
+"""Disk cache of the survey of a drive, so that a restarted server does not repeat it."""
 
 from __future__ import annotations
 
@@ -24,13 +24,12 @@ from lidar_studio.survey import FrameSurvey
 Array = np.ndarray[Any, Any]
 FOLDER, LAYOUT = "survey", 2
 FRAMES_PER_FILE = 20
-MAX_BYTES = 300 * 10**6  # limit for all files; 1,000 frames need a tenth of it
+MAX_BYTES = 300 * 10**6  # limit for all files together; 1,000 frames take about 30 MB
 PARTS = "detections", "classes", "scores", "boxes", "images", "features", "things"
 
 
 def make_key(drive: Drive, choice: DetectorChoice | None) -> str:
-    """Return all inputs of a survey as JSON: the drive, the detector's weights and parameters, and the
-    version of the package."""
+    """Return a JSON string with all inputs of a survey: drive, weights, parameters and package version."""
     weights = "" if choice is None else choice.weights
     file = Path(weights)
     parameters = (
@@ -51,19 +50,20 @@ def make_key(drive: Drive, choice: DetectorChoice | None) -> str:
 
 
 def clear(folder: Path) -> None:
-    """Remove all files of the cache."""
+    """Remove all files of a cache."""
     for path in folder.glob("*.npz"):
         path.unlink(missing_ok=True)
 
 
 def write(folder: Path, key: str, first: int, surveys: Sequence[FrameSurvey]) -> None:
-    """Write one file of the cache, with the surveys from frame `first` on.
+    """Write one file of a cache.
 
     Args:
-        surveys: FRAMES_PER_FILE, or fewer at the end of the drive.
+        first: Index of the first frame in the file.
+        surveys: Surveys of FRAMES_PER_FILE frames, or fewer at the end of the drive.
 
     Raises:
-        InputError: it cannot be written, or the cache is too large.
+        InputError: The file cannot be written, or the cache would become too large.
     """
     columns: list[list[Array]] = [[] for _ in PARTS]
     names = sorted({name for survey in surveys for name in survey.features})
@@ -92,7 +92,9 @@ def write(folder: Path, key: str, first: int, surveys: Sequence[FrameSurvey]) ->
     np.savez_compressed(content, key=np.array(key), names=np.array(names, str), poses=np.array(poses), **arrays)
     size = content.getbuffer().nbytes + sum(p.stat().st_size for p in folder.glob("*.npz"))
     if size > MAX_BYTES:
-        raise InputError(f"the survey is larger than {MAX_BYTES / 1e6:.0f} MB; only frames before {first} are cached")
+        raise InputError(
+            f"the survey takes more than {MAX_BYTES / 1e6:.0f} MB, so only the frames before {first} are cached"
+        )
     write_bytes(folder / _file_name(first), content.getbuffer())
 
 
@@ -101,7 +103,7 @@ def _file_name(first: int) -> str:
 
 
 def read(folder: Path, key: str) -> tuple[list[FrameSurvey], str]:
-    """Return the cached surveys of the first frames, and the reason why later ones were ignored, or ""."""
+    """Return the cached surveys of the first frames, and a message if other cached surveys were ignored."""
     surveys: list[FrameSurvey] = []
     first = 0
     while (path := folder / _file_name(first)).is_file():

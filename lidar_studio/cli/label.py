@@ -1,4 +1,4 @@
-"""The label verb: serves the page on which a person labels a drive."""
+"""The label command: serve the page on which a person labels a drive."""
 
 from __future__ import annotations
 
@@ -22,23 +22,24 @@ if TYPE_CHECKING:
 
 @click.command(cls=Command)
 @data_argument()
-@click.option("--sequence", metavar="NAME", help="The drive of DATA to label, if it has several.")
-@out_folder_option("Folder of the journal; an existing one is continued. Default: out/label/NAME OF THE DRIVE.")
+@click.option("--sequence", metavar="NAME", help="Drive to label if DATA contains several.")
+@out_folder_option("Folder of the journal. An existing journal is resumed. Default: out/label/NAME OF THE DRIVE.")
 @port_option
 @browser_option
 @detector_options()
 @click.option(
     "--propose/--no-propose",
     default=True,
-    help="Propose tracks for the whole drive at the start, unless the journal has proposals.  [default: propose]",
+    help="Propose tracks for the whole drive at the start, unless the journal already contains proposals."
+    "  [default: propose]",
 )
-@click.option("--show-labels", is_flag=True, help="Show the existing labels of the drive.")
+@click.option("--show-labels", is_flag=True, help="Also show the labels that DATA contains.")
 @click.option(
     "--import",
     "imports",
     multiple=True,
     metavar="FORMAT:PATH",
-    help="Import the labels at PATH before the page is served.",
+    help="Import the labels at PATH at the start. May be given several times.",
 )
 @click.option(
     "--export", "exports", metavar="FORMAT:PATH", help="Write the accepted tracks of the journal to PATH and exit."
@@ -54,9 +55,9 @@ def label(
     force: bool,
     **page: Any,
 ) -> None:
-    """Label a drive on a page in the browser: click, accept, correct.
+    """Label a drive on a page in the browser: click objects, accept proposals, correct boxes.
 
-    Every action is saved to FOLDER/journal.jsonl immediately; Ctrl-C stops the server.
+    Every action is saved to FOLDER/journal.jsonl immediately. Press Ctrl-C to stop the server.
 
     \b
     Examples:
@@ -68,41 +69,43 @@ def label(
     from lidar_studio.journal import JOURNAL_NAME
     from lidar_studio.session import AlreadyImportedError, open_session
 
-    sources = [_split_format_and_path("--import", text) for text in imports]
-    target = None if exports is None else _split_format_and_path("--export", exports)
+    import_sources = [_split_format_and_path("--import", text) for text in imports]
+    export_target = None if exports is None else _split_format_and_path("--export", exports)
     recording = open_and_describe(data)
     with show_scanning(data):
         drive = select_drive(recording, sequence)
-    if target is None:
+    if export_target is None:
         require_clouds(drive)
     folder = out or Path("out/label") / drive.name
-    if target is not None and not imports and not (folder / JOURNAL_NAME).is_file():
-        raise InputError(f"there is no journal in {folder}; give its folder with --out")
+    if export_target is not None and not imports and not (folder / JOURNAL_NAME).is_file():
+        raise InputError(f"no journal in {folder}; specify the folder of the journal with --out")
     with open_session(drive, folder, detector) as session:
         if session.journal.message:
             errors.print(session.journal.message, style="yellow")
-        for format_name, path in sources:
+        for format_name, path in import_sources:
             try:
-                session.do({"do": "import", "format": format_name, "path": path})
-            except AlreadyImportedError as error:  # the same import command has been run before
+                session.execute({"do": "import", "format": format_name, "path": path})
+            except AlreadyImportedError as error:  # the same command has been run before
                 errors.print(str(error), style="yellow")
-        if target is not None:
-            written = session.export(target[0], os.path.abspath(target[1]), force)
-            console.print(f"{written['path']}: {written['boxes']} boxes in {written['frames']} frames")
-            for text in written["left_out"]:
+        if export_target is not None:
+            result = session.export(export_target[0], os.path.abspath(export_target[1]), force)
+            console.print(f"{result['path']}: {result['boxes']} boxes in {result['frames']} frames")
+            for text in result["left_out"]:
                 errors.print(f"left out: {text}", style="yellow")
         else:
             _serve(drive, session, **page)
 
 
 def _split_format_and_path(option: str, text: str) -> tuple[str, str]:
-    """Split FORMAT:PATH. InputError for an unknown format, UsageError without a path."""
+    """Split FORMAT:PATH. Raises InputError if the format is unknown, UsageError if there is no path."""
     from lidar_perception.labels.exchange import FORMATS, READERS
     from lidar_perception.labels.names import resolve_format
 
     format_name, _, path = text.partition(":")
     if not path:
-        raise click.UsageError(f"{option} {text} must be FORMAT:PATH, such as openlabel:labels.json")
+        raise click.UsageError(
+            f"invalid value {text!r} for {option}; expected FORMAT:PATH, such as openlabel:labels.json"
+        )
     return resolve_format(format_name, READERS if option == "--import" else FORMATS), path
 
 
@@ -117,12 +120,13 @@ def _serve(drive: Drive, session: Session, port: int, browser: bool, propose: bo
 
     def on_start(url: str) -> None:
         console.print(url)
-        state = f"continues after {count} actions" if count else "is new"
-        errors.print(f"the journal {session.journal.path.absolute()} {state}; Ctrl-C stops the server", style="dim")
+        path = session.journal.path.absolute()
+        text = f"resumed {path} after {count} actions" if count else f"started a new journal {path}"
+        errors.print(f"{text}; press Ctrl-C to stop the server", style="dim")
         if propose:
             session.start_proposals()
         if browser:
             webbrowser.open(url)
 
-    layers = Results().bind_layers(drive) if show_labels else None
-    asyncio.run(serve(PageContent(drive, session, layers), port, on_start))
+    make_layers = Results().bind_layers(drive) if show_labels else None
+    asyncio.run(serve(PageContent(drive, session, make_layers), port, on_start))

@@ -1,4 +1,4 @@
-"""The view verb: serves the page that shows recordings, results and running graphs."""
+"""The view command: serve the page that shows recordings, results and running graphs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lidar_perception.types import InputError
 if TYPE_CHECKING:
     from lidar_studio.server import PageContent
 
-WEIGHTS = (".safetensors", ".onnx", ".json")
+WEIGHTS_SUFFIXES = (".safetensors", ".onnx", ".json")
 
 
 @click.command(cls=Command)
@@ -33,38 +33,40 @@ WEIGHTS = (".safetensors", ".onnx", ".json")
     multiple=True,
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="KITTI result files, FOLDER/NAME.txt, such as `detect --format kitti "
-    "--out FOLDER` writes. May be given several times.",
+    help="Show the KITTI result files FOLDER/NAME.txt, for example the output of "
+    "`detect --format kitti --out FOLDER`. May be given several times.",
 )
 @click.option(
     "--points",
     "--topic",
     "points",
     metavar="TOPIC",
-    help="Topic of the clouds of a bag "
-    "or of the running graph. Default: clustered ones, else /points, else the only cloud "
-    "topic.",
+    help="Topic of the clouds in a bag or in the running graph. "
+    "Default: clouds with clusters, otherwise /points, otherwise the only cloud topic.",
 )
 @click.option(
     "--detections",
     multiple=True,
     metavar="TOPIC",
-    help="With --live: a topic of boxes, "
-    "MarkerArray or Detection3DArray. Default: all */output/detections that belong to "
-    "the clouds. May be given several times.",
+    help="With --live: topic with boxes (MarkerArray or Detection3DArray). "
+    "Default: all */output/detections that belong to the clouds. May be given several times.",
 )
 @click.option(
     "--namespace",
     default="",
     metavar="NAME",
-    help="With --live: show the nodes in this namespace, / for those without one, if several graphs run.",
+    help="With --live: namespace of the nodes to show if several graphs are running; / for nodes without a namespace.",
 )
-@click.option("--sequence", metavar="NAME", help="The drive of DATA to show, if it has several.")
+@click.option("--sequence", metavar="NAME", help="Drive to show if DATA contains several.")
 @port_option
 @browser_option
 @click.option("--frame", type=click.IntRange(0), default=0, show_default=True, metavar="N", help="First frame to show.")
 @click.option(
-    "--theme", type=Choice(["auto", "light", "dark"]), default="auto", show_default=True, help="Colours of the page."
+    "--theme",
+    type=Choice(["auto", "light", "dark"]),
+    default="auto",
+    show_default=True,
+    help="Colour theme of the page.",
 )
 def view(
     data: Path | None,
@@ -81,9 +83,9 @@ def view(
     theme: str,
 ) -> None:
     """Show a recording and its results on a page in the browser: clouds with ground and
-    clusters, labels, detections by source and score, missed and false ones, tracks. DATA is a
-    bag, such as the result bag of the demo, or the folder of a data set; --live shows the newest
-    frame of the nodes that run on this ROS_DOMAIN_ID.
+    clusters, labels, tracks, detections by source and score, misses and false positives. DATA is a
+    bag, such as the result bag of the demo, or the folder of a data set. With --live, the page shows
+    the newest frames of the nodes that run on this ROS_DOMAIN_ID.
 
     \b
     Examples:
@@ -99,14 +101,16 @@ def view(
     from lidar_studio.server import serve
 
     if (data is None) != live:
-        raise click.UsageError("give DATA, the path of a recording, or --live")
-    incompatible = (
+        raise click.UsageError("specify either DATA (the path of a recording) or --live")
+    incompatible_options = (
         {"--weights": detectors, "--results": results, "--sequence": sequence}
         if live
         else {"--detections": detections, "--namespace": namespace}
     )
-    if wrong_options := [name for name, value in incompatible.items() if value]:
-        raise click.UsageError(f"{', '.join(wrong_options)}: {'not with' if live else 'only with'} --live")
+    if names := ", ".join(name for name, value in incompatible_options.items() if value):
+        raise click.UsageError(
+            f"{names} cannot be used with --live" if live else f"{names} can only be used with --live"
+        )
 
     def on_start(url: str) -> None:
         url += f"&frame={frame}&theme={theme}"
@@ -120,7 +124,9 @@ def view(
         return
     content = _open_content(data, detectors, results, points, sequence)
     if frame >= content.drive.end:
-        raise InputError(f"{data} has no frame {frame}; it has {content.drive.end}")
+        raise InputError(
+            f"{data} has only {content.drive.end} frames (0 to {content.drive.end - 1}), so no frame {frame}"
+        )
     asyncio.run(serve(content, port, on_start))
 
 
@@ -133,12 +139,12 @@ def _open_live_content(namespace: str, points: str, detections: tuple[str, ...])
 
     require_rclpy()
     use_large_shared_memory(points != "" and is_fed_by_driver([points]))
-    from lidar_studio.live_view import run_live_view  # imported after the profile is set
+    from lidar_studio.live_view import run_live_view  # imports rclpy, which must see the DDS profile set above
 
     name = "/".join(filter(None, (f"ROS domain {os.environ.get('ROS_DOMAIN_ID') or 0}", namespace.strip("/"))))
     live = LiveGraph(name)
     with run_live_view(live, None, namespace, points, detections):
-        yield PageContent(live, layers=live.layers, tracks=live.list_tracks)
+        yield PageContent(live, make_layers=live.make_layers, list_tracks=live.list_tracks)
 
 
 def _open_content(
@@ -166,7 +172,7 @@ def _open_content(
     require_clouds(drive)
     shown_results = result_sources.Results()
     if is_bag:
-        drive = replace(drive, scan=result_sources.read_recorded_scan)
+        drive = replace(drive, make_scan=result_sources.read_recorded_scan)
         shown_results = result_sources.read_recorded_results(recording.frames.poses, [f.stamp_ns for f in drive.frames])
     height = drive.frames[0].sensor_height
     sources = {
@@ -178,13 +184,16 @@ def _open_content(
     shown_results = result_sources.Results(
         {**shown_results.sources, **dict(zip(names, sources.values()))}, shown_results.tracks
     )
-    return PageContent(drive, layers=shown_results.bind_layers(drive), tracks=lambda: shown_results.tracks)
+    return PageContent(drive, make_layers=shown_results.bind_layers(drive), list_tracks=lambda: shown_results.tracks)
 
 
 def make_short_names(paths: list[Path], used_names: Collection[str] = ()) -> list[str]:
-    """Return a unique short name for each path: its shortest end that is not the end of another one
-    and not in `used_names`, else the whole path."""
-    parts = [path.with_suffix("").parts if path.suffix in WEIGHTS else path.parts for path in paths]
+    """Return a unique short name for each path.
+
+    The name is the shortest suffix of the path that is neither a suffix of another path nor in
+    `used_names`, otherwise the full path.
+    """
+    parts = [path.with_suffix("").parts if path.suffix in WEIGHTS_SUFFIXES else path.parts for path in paths]
     names = []
     for i, path_parts in enumerate(parts):
         suffixes = (path_parts[-k:] for k in range(1, len(path_parts) + 1))

@@ -1,4 +1,4 @@
-// Boxes of the frame shown, as lines in the 3D view; the filled face is the front.
+// Boxes of the shown frame as lines in the 3D view. The filled face is the front.
 
 import * as THREE from "three";
 import { LineMaterial } from "three/addons/lines/LineMaterial.js";
@@ -11,7 +11,7 @@ import { draw, scene } from "./scene.js";
 import { on, store } from "./store.js";
 
 const TRAIL_FRAMES = 30;
-const SELECTED = { dark: [255, 255, 255], light: [17, 24, 39] };
+const SELECTION_COLOUR = { dark: [255, 255, 255], light: [17, 24, 39] };
 const OPACITY_BY_KIND = { proposed: 0.6, interpolated: 0.75, key: 1 };
 
 const thinLines = makeLines(1.6), thickLines = makeLines(3.2);
@@ -37,7 +37,7 @@ function makeLines(linewidth) {
 const linear = new THREE.Color();
 const toLinear = ([r, g, b]) => linear.setRGB(r / 255, g / 255, b / 255, THREE.SRGBColorSpace).toArray();
 
-/** Blend a colour with the background; less certain boxes are fainter. */
+/** Blend a colour with the background, so that uncertain boxes look fainter. */
 function blend(colour, opacity) {
   const background = getTheme() === "dark" ? 17 : 245;
   return colour.map((c) => background + (c - background) * opacity);
@@ -73,10 +73,10 @@ function setFrontFaces(boxes) {
   frontFaces.geometry.setAttribute("color", new THREE.Float32BufferAttribute(colours, 3));
 }
 
-/** Compute the last positions of a track, in the sensor frame at `frame`; without poses, each position
- * is in the sensor frame at its own time. */
+/** Compute the last positions of a track in the sensor frame at `frame`. Without poses, each position is in
+ * the sensor frame at its own time. */
 function computeTrail(track, frame = store.frame) {
-  if (track.trails) return track.trails[frame] ?? []; // published by the tracker
+  if (track.trails) return track.trails[frame] ?? []; // the tracker has published them
   const { frames } = store.drive, currentPose = frames[frame].pose, positions = [];
   for (let i = Math.max(0, frame - TRAIL_FRAMES); i <= frame; i++) {
     const box = track.byFrame.get(i)?.box;
@@ -108,17 +108,17 @@ function setTrails(boxes) {
 function rebuild() {
   if (!store.drive) return;
   const normal = [], emphasized = [];
-  const withTracks = store.mode === "label" || store.layers.tracks;
-  for (const shown of withTracks ? listShownBoxes() : []) {
+  const showsTracks = store.mode === "label" || store.layers.tracks;
+  for (const shown of showsTracks ? listShownBoxes() : []) {
     const { track, box, kind, colour } = shown, isSelected = track.id === store.selected;
     const opacity = track.state === "accepted" ? 1 : track.state === "rejected" ? 0.35
       : OPACITY_BY_KIND[kind];
-    const item = { track, box, colour: isSelected ? SELECTED[getTheme()] : blend(rgb(colour), opacity) };
+    const item = { track, box, colour: isSelected ? SELECTION_COLOUR[getTheme()] : blend(rgb(colour), opacity) };
     const isEmphasized = isSelected || store.alsoSelected.has(track.id) || track.id === store.hover;
     (isEmphasized ? emphasized : normal).push(item);
   }
   for (const { box, colour, emphasized: isError, isSelected } of listShownResults()) {
-    const item = { box, colour: isSelected ? SELECTED[getTheme()] : rgb(colour) };
+    const item = { box, colour: isSelected ? SELECTION_COLOUR[getTheme()] : rgb(colour) };
     (isError || isSelected ? emphasized : normal).push(item);
   }
   setLines(thinLines, normal);

@@ -1,8 +1,8 @@
-// Boxes [x y z l w h yaw] (centre, metres, radians, z up) as plain arrays: pure functions.
+// Pure functions on boxes [x y z l w h yaw] (centre and size in metres, yaw in radians, z up).
 
-const MIN_SIZE = 0.1; // metres
+const MIN_SIZE_M = 0.1;
 
-function wrap(angle) {
+function wrapAngle(angle) {
   return angle - 2 * Math.PI * Math.floor((angle + Math.PI) / (2 * Math.PI));
 }
 
@@ -12,19 +12,19 @@ export function computeAxis(box, axis) {
   return axis === 0 ? [c, s, 0] : axis === 1 ? [-s, c, 0] : [0, 0, 1];
 }
 
-/** Move one face outwards by delta metres; the opposite face stays in place. */
+/** Move one face outwards by delta metres. The opposite face stays in place. */
 export function moveFace(box, axis, sign, delta) {
-  const growth = Math.max(MIN_SIZE, box[3 + axis] + delta) - box[3 + axis];
-  const direction = computeAxis(box, axis), moved = box.slice();
-  for (let k = 0; k < 3; k++) moved[k] += direction[k] * sign * growth / 2;
-  moved[3 + axis] += growth;
-  return moved;
+  const growth = Math.max(MIN_SIZE_M, box[3 + axis] + delta) - box[3 + axis];
+  const direction = computeAxis(box, axis), newBox = box.slice();
+  for (let k = 0; k < 3; k++) newBox[k] += direction[k] * sign * growth / 2;
+  newBox[3 + axis] += growth;
+  return newBox;
 }
 
 export function translate(box, dx, dy, dz) {
-  const moved = box.slice();
-  moved[0] += dx; moved[1] += dy; moved[2] += dz;
-  return moved;
+  const newBox = box.slice();
+  newBox[0] += dx; newBox[1] += dy; newBox[2] += dz;
+  return newBox;
 }
 
 /** Move a box along its own axes. */
@@ -34,12 +34,12 @@ export function moveAlongAxes(box, forward, left, up) {
 }
 
 export function rotate(box, angle) {
-  const turned = box.slice();
-  turned[6] = wrap(box[6] + angle);
-  return turned;
+  const newBox = box.slice();
+  newBox[6] = wrapAngle(box[6] + angle);
+  return newBox;
 }
 
-/** Transform a point to the axes of the box, relative to its centre. */
+/** Transform a point from the sensor frame to the axes of a box, relative to its centre. */
 export function toLocal(box, x, y, z) {
   const c = Math.cos(box[6]), s = Math.sin(box[6]), dx = x - box[0], dy = y - box[1];
   return [c * dx + s * dy, -s * dx + c * dy, z - box[2]];
@@ -53,8 +53,8 @@ export function toWorld(box, u, v, w) {
 const SIGNS = [[1, 1, -1], [1, -1, -1], [-1, -1, -1], [-1, 1, -1],
                [1, 1, 1], [1, -1, 1], [-1, -1, 1], [-1, 1, 1]];
 
-/** Compute the eight corners: four of the bottom, then four of the top; the first two of each are at
- * the front. */
+/** Compute the eight corners: four at the bottom, then four at the top. The first two of each are at the
+ * front. */
 export function computeCorners(box) {
   return SIGNS.map(([a, b, c]) => toWorld(box, a * box[3] / 2, b * box[4] / 2, c * box[5] / 2));
 }
@@ -67,17 +67,17 @@ export function intersectBox(origin, direction, box) {
   const o = toLocal(box, ...origin), c = Math.cos(box[6]), s = Math.sin(box[6]);
   const d = [c * direction[0] + s * direction[1], -s * direction[0] + c * direction[1],
              direction[2]];
-  let near = 0, far = Infinity;
+  let entry = 0, exit = Infinity;
   for (let k = 0; k < 3; k++) {
-    const half = box[3 + k] / 2, a = (-half - o[k]) / d[k], b = (half - o[k]) / d[k];
-    near = Math.max(near, Math.min(a, b));
-    far = Math.min(far, Math.max(a, b));
+    const halfSize = box[3 + k] / 2, a = (-halfSize - o[k]) / d[k], b = (halfSize - o[k]) / d[k];
+    entry = Math.max(entry, Math.min(a, b));
+    exit = Math.min(exit, Math.max(a, b));
   }
-  return near <= far ? near : null;
+  return entry <= exit ? entry : null;
 }
 
-/** Find the point of the line p + t a (unit vector a) nearest to a ray. Returns t, or null if they are
- * parallel. */
+/** Find the point on the line p + t a (unit vector a) that is nearest to a ray. Returns t, or null if line
+ * and ray are parallel. */
 export function findNearestOnLine(p, a, origin, direction) {
   const dot = (u, v) => u[0] * v[0] + u[1] * v[1] + u[2] * v[2];
   const w = [p[0] - origin[0], p[1] - origin[1], p[2] - origin[2]];
@@ -92,18 +92,18 @@ export function intersectLevel(origin, direction, z) {
     ? [origin[0] + t * direction[0], origin[1] + t * direction[1], z] : null;
 }
 
-/** Transform a box from the sensor frame to the fixed frame, without roll and pitch. `pose` has 16
- * numbers, row by row. */
+/** Transform a box from the sensor frame to the fixed frame, ignoring roll and pitch. The pose is a 4 x 4
+ * matrix as 16 numbers, row by row. */
 export function toFixedFrame(box, pose) {
-  const [x, y, z] = box, moved = box.slice();
+  const [x, y, z] = box, fixedBox = box.slice();
   for (let k = 0; k < 3; k++) {
-    moved[k] = pose[4 * k] * x + pose[4 * k + 1] * y + pose[4 * k + 2] * z + pose[4 * k + 3];
+    fixedBox[k] = pose[4 * k] * x + pose[4 * k + 1] * y + pose[4 * k + 2] * z + pose[4 * k + 3];
   }
-  moved[6] = wrap(box[6] + Math.atan2(pose[4], pose[0]));
-  return moved;
+  fixedBox[6] = wrapAngle(box[6] + Math.atan2(pose[4], pose[0]));
+  return fixedBox;
 }
 
-/** Transform a point (x, y, z) from the fixed frame to the sensor frame at a pose. */
+/** Transform a point (x, y, z) from the fixed frame to the frame of a sensor with this pose. */
 export function toSensorFrame(point, pose) {
   const d = [point[0] - pose[3], point[1] - pose[7], point[2] - pose[11]];
   return [0, 1, 2].map((k) => pose[k] * d[0] + pose[4 + k] * d[1] + pose[8 + k] * d[2]);

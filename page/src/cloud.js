@@ -1,20 +1,20 @@
-// Clouds: loading, caching, prefetching; and moving to another frame.
+// Loading, caching and prefetching of clouds, and navigation between frames.
 
 import { makeCache, getBytes } from "./api.js";
 import { showError } from "./messages.js";
 import { fetchResults } from "./results.js";
 import { notify, emit, store } from "./store.js";
 
-const MAX_CACHED = 12; // clouds of 114,000 points take 2 MB each
-const PREFETCH_OFFSETS = [1, -1, 2, 3]; // frames, relative to the one shown, in the direction of travel
-const MAX_WAIT_MS = 120; // for results, so that they appear with their cloud
+const MAX_CACHED_CLOUDS = 12; // a cloud of 114,000 points takes 2 MB
+const PREFETCH_OFFSETS = [1, -1, 2, 3]; // frames relative to the shown one; positive in the direction of navigation
+const MAX_WAIT_MS = 120; // maximum time a cloud waits for its results, so that both appear together
 const EMPTY = { count: 0, xyz: new Float32Array(), intensity: new Uint8Array(),
                 ground: new Uint8Array(), cluster: new Uint32Array(), floor: -1.7 };
 
-const clouds = makeCache(async (frame) => parseCloud(await getBytes(`/api/cloud/${frame}`)), MAX_CACHED);
+const clouds = makeCache(async (frame) => parseCloud(await getBytes(`/api/cloud/${frame}`)), MAX_CACHED_CLOUDS);
 export const loadCloud = clouds.get;
 
-/** Make a cloud from the bytes of /api/cloud, without copying. */
+/** Make a cloud from the bytes of /api/cloud, without copying them. */
 function parseCloud(buffer) {
   const magic = String.fromCharCode(...new Uint8Array(buffer, 0, 4));
   if (magic !== "LPC1") throw new Error("the server sent an invalid cloud");
@@ -31,8 +31,8 @@ function parseCloud(buffer) {
   return { ...cloud, floor: estimateFloor(cloud) };
 }
 
-/** Return the median height of the ground near the sensor, or a low percentile of all points if there
- * is no ground. */
+/** Return the median height of the ground points near the sensor. If there are too few, return a low
+ * percentile of the heights of all points. */
 function estimateFloor({ xyz, ground, count }) {
   const heights = [];
   for (let i = 0; i < count && heights.length < 2000; i++) {
@@ -47,7 +47,7 @@ function estimateFloor({ xyz, ground, count }) {
   return heights[heights.length >> 1];
 }
 
-/** Show a frame once its cloud is loaded; the last request wins. Emits "leaving-frame" first. */
+/** Show a frame when its cloud is loaded, unless another frame is requested first. Emits "leaving-frame". */
 export async function goTo(frame) {
   const last = store.drive.frames.length - 1;
   frame = Math.max(store.drive.first, Math.min(last, Math.round(frame)));
@@ -61,10 +61,10 @@ export async function goTo(frame) {
 export async function showFrame(frame) {
   let cloud = EMPTY;
   try {
-    if (frame >= 0) cloud = await loadCloud(frame); // -1: nothing received yet
+    if (frame >= 0) cloud = await loadCloud(frame); // -1: no cloud received yet
   } catch (error) {
     if (store.requestedFrame === frame) {
-      showError(`Frame ${store.drive.frames[frame].name} has no cloud: ${error.message}`);
+      showError(`Cannot load the cloud of frame ${store.drive.frames[frame].name}: ${error.message}`);
     }
   }
   if (store.mode === "view" && frame >= 0) {
@@ -72,7 +72,7 @@ export async function showFrame(frame) {
                         new Promise((resolve) => setTimeout(resolve, MAX_WAIT_MS))]);
   }
   if (store.requestedFrame !== frame) return;
-  emit("leaving-frame"); // a key may have moved a box meanwhile
+  emit("leaving-frame"); // a key may have moved a box while the cloud was loading
   store.frame = frame;
   store.cloud = cloud;
   store.draft = null;
@@ -80,17 +80,17 @@ export async function showFrame(frame) {
   prefetch(frame);
 }
 
-let direction = 1, previous = 0;
+let direction = 1, previousFrame = 0;
 
-/** Load the clouds around a frame, one after another so that the nearest arrives first. */
+/** Load the clouds around a frame one after another, so that the nearest ones arrive first. */
 async function prefetch(frame) {
   if (store.playing && store.drive.live) return; // the next frame does not exist yet
-  if (frame !== previous) direction = Math.sign(frame - previous);
-  previous = frame;
-  const frames = store.drive.frames.length;
+  if (frame !== previousFrame) direction = Math.sign(frame - previousFrame);
+  previousFrame = frame;
+  const end = store.drive.frames.length;
   for (const next of PREFETCH_OFFSETS.map((k) => frame + k * direction)) {
-    if (next < store.drive.first || next >= frames || store.requestedFrame !== frame) continue;
+    if (next < store.drive.first || next >= end || store.requestedFrame !== frame) continue;
     if (store.mode === "view") fetchResults(next).catch(() => null);
-    try { await loadCloud(next); } catch { /* reported when it is shown */ }
+    try { await loadCloud(next); } catch { /* the error is reported when this frame is shown */ }
   }
 }

@@ -1,4 +1,4 @@
-// Colours of points, classes and tracks, for a dark and a light page.
+// Colours of points, classes and tracks for the dark and the light theme.
 
 import { toLocal } from "./boxmath.js";
 import { getBox, findClass, store } from "./store.js";
@@ -12,14 +12,14 @@ const GROUND = { dark: "#333e52", light: "#cdd5e0" };
 const OBJECT = { dark: "#d7dee9", light: "#2d3a4f" };
 export const HIGHLIGHT = { dark: "#ffffff", light: "#000000" };
 const ROAD = { dark: "#5b6f93", light: "#7d8fb0" };
-const MAX_BRIGHTNESS = 150; // of 255: brighter colours are darkened on a light page
-const HEIGHT_SPAN_M = 4; // above the ground; higher points have the last colour
+const MAX_BRIGHTNESS = 150; // maximum brightness (0 to 255) of a colour in the light theme
+const HEIGHT_SPAN_M = 4; // height above the ground at which the colour ramp ends
 
 export const rgb = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16));
 
 export function getTheme() {
-  const selected = document.documentElement.dataset.theme;
-  if (selected === "light" || selected === "dark") return selected;
+  const theme = document.documentElement.dataset.theme;
+  if (theme === "light" || theme === "dark") return theme;
   return matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark";
 }
 
@@ -27,56 +27,56 @@ export function getTheme() {
 const pack = ([r, g, b]) => (r | g << 8 | b << 16) >>> 0;
 
 function makeRamp(stops, steps = 256) {
-  const table = new Uint32Array(steps), ends = stops.map(rgb);
+  const table = new Uint32Array(steps), colours = stops.map(rgb);
   for (let i = 0; i < steps; i++) {
-    const at = i / (steps - 1) * (ends.length - 1), k = Math.min(ends.length - 2, Math.floor(at));
-    table[i] = pack(ends[k].map((c, n) => Math.round(c + (at - k) * (ends[k + 1][n] - c))));
+    const position = i / (steps - 1) * (colours.length - 1), k = Math.min(colours.length - 2, Math.floor(position));
+    table[i] = pack(colours[k].map((c, n) => Math.round(c + (position - k) * (colours[k + 1][n] - c))));
   }
   return table;
 }
 const TABLES = { dark: makeRamp(RAMPS.dark), light: makeRamp(RAMPS.light) };
 
-/** Make a colour from a number; the same number always gives the same colour. */
-function makeHue(number, themeName) {
-  const h = number * 0.61803398875 % 1, light = themeName === "dark" ? 0.66 : 0.4;
+/** Return a colour for a number. The same number always gives the same colour. */
+function getNumberColour(number, themeName) {
+  const hue = number * 0.61803398875 % 1, lightness = themeName === "dark" ? 0.66 : 0.4;
   return pack([0, 8, 4].map((n) => {
-    const k = (n + 12 * h) % 12, swing = 0.75 * Math.min(light, 1 - light);
-    return Math.round(255 * (light - swing * Math.max(-1, Math.min(k - 3, 9 - k, 1))));
+    const k = (n + 12 * hue) % 12, amplitude = 0.75 * Math.min(lightness, 1 - lightness);
+    return Math.round(255 * (lightness - amplitude * Math.max(-1, Math.min(k - 3, 9 - k, 1))));
   }));
 }
 
 export function getClassColour(name) {
-  const colour = findClass(name)?.color ?? "#9b8afb"; // an unknown class
+  const colour = findClass(name)?.color ?? "#9b8afb"; // colour of unknown classes
   const channels = rgb(colour), brightness = 0.3 * channels[0] + 0.59 * channels[1] + 0.11 * channels[2];
   if (getTheme() === "dark" || brightness < MAX_BRIGHTNESS) return colour;
-  const darker = channels.map((c) => Math.round(c * MAX_BRIGHTNESS / brightness));
-  return `#${darker.map((c) => c.toString(16).padStart(2, "0")).join("")}`;
+  const darkerChannels = channels.map((c) => Math.round(c * MAX_BRIGHTNESS / brightness));
+  return `#${darkerChannels.map((c) => c.toString(16).padStart(2, "0")).join("")}`;
 }
 
-/** Fill `bytes` with the colours of a cloud, four bytes per point. */
+/** Fill `bytes` with the colours of the points of a cloud, four bytes per point. */
 export function paintCloud(bytes, cloud, scheme) {
   const colours = new Uint32Array(bytes.buffer), themeName = getTheme();
   const { count, xyz, intensity, ground, cluster, floor } = cloud, table = TABLES[themeName];
-  const [muted, flat, object] = [MUTED, GROUND, OBJECT].map((c) => pack(rgb(c[themeName])));
+  const [mutedColour, groundColour, objectColour] = [MUTED, GROUND, OBJECT].map((c) => pack(rgb(c[themeName])));
   if (scheme === "height") {
     for (let i = 0; i < count; i++) {
-      const share = Math.min(1, Math.max(0, (xyz[3 * i + 2] - floor) / HEIGHT_SPAN_M));
-      colours[i] = ground[i] ? flat : table[255 * share | 0];
+      const fraction = Math.min(1, Math.max(0, (xyz[3 * i + 2] - floor) / HEIGHT_SPAN_M));
+      colours[i] = ground[i] ? groundColour : table[255 * fraction | 0];
     }
   } else if (scheme === "intensity") {
     for (let i = 0; i < count; i++) colours[i] = table[255 * Math.sqrt(intensity[i] / 255) | 0];
   } else if (scheme === "ground") {
-    const road = pack(rgb(ROAD[themeName]));
-    for (let i = 0; i < count; i++) colours[i] = ground[i] ? road : object;
+    const roadColour = pack(rgb(ROAD[themeName]));
+    for (let i = 0; i < count; i++) colours[i] = ground[i] ? roadColour : objectColour;
   } else if (scheme === "cluster") {
-    const colourById = new Map([[0, muted]]);
+    const colourById = new Map([[0, mutedColour]]);
     for (let i = 0; i < count; i++) {
       const id = cluster[i];
-      if (!colourById.has(id)) colourById.set(id, makeHue(id, themeName));
-      colours[i] = !id && ground[i] ? flat : colourById.get(id);
+      if (!colourById.has(id)) colourById.set(id, getNumberColour(id, themeName));
+      colours[i] = !id && ground[i] ? groundColour : colourById.get(id);
     }
   } else {
-    for (let i = 0; i < count; i++) colours[i] = ground[i] ? flat : muted;
+    for (let i = 0; i < count; i++) colours[i] = ground[i] ? groundColour : mutedColour;
     paintClasses(colours, cloud);
   }
 }
@@ -86,20 +86,20 @@ function paintClasses(colours, { xyz, count }) {
     const radius = Math.hypot(box[3], box[4]) / 2, packedColour = pack(rgb(colour));
     for (let i = 0, k = 0; i < count; i++, k += 3) {
       if (Math.abs(xyz[k] - box[0]) > radius || Math.abs(xyz[k + 1] - box[1]) > radius) continue;
-      const at = toLocal(box, xyz[k], xyz[k + 1], xyz[k + 2]);
-      if (at.every((value, n) => Math.abs(value) <= box[3 + n] / 2)) colours[i] = packedColour;
+      const local = toLocal(box, xyz[k], xyz[k + 1], xyz[k + 2]);
+      if (local.every((value, n) => Math.abs(value) <= box[3 + n] / 2)) colours[i] = packedColour;
     }
   }
 }
 
-/** List the boxes of tracks in the frame shown: {track, box, kind, colour}. Rejected tracks are left
- * out unless selected. */
+/** List the boxes of tracks in the shown frame, as {track, box, kind, colour}, without rejected tracks that
+ * are not selected. */
 export function listShownBoxes() {
-  const shown = [];
+  const boxes = [];
   for (const track of store.tracks.values()) {
     if (track.state === "rejected" && track.id !== store.selected) continue;
     const entry = getBox(track);
-    if (entry) shown.push({ track, ...entry, colour: getClassColour(track.class) });
+    if (entry) boxes.push({ track, ...entry, colour: getClassColour(track.class) });
   }
-  return shown;
+  return boxes;
 }

@@ -5,7 +5,7 @@ const SVG = "http://www.w3.org/2000/svg";
 function applyAttributes(node, attributes, children) {
   for (const [name, value] of Object.entries(attributes)) {
     if (name.startsWith("on")) node[name] = value;
-    else if (name === "style") node.style.cssText = value; // the Content-Security-Policy forbids the attribute
+    else if (name === "style") node.style.cssText = value; // the Content-Security-Policy forbids the style attribute
     else if (value === true) node.setAttribute(name, "");
     else if (value !== false && value !== null && value !== undefined) {
       node.setAttribute(name, value);
@@ -52,14 +52,14 @@ export function icon(name) {
     svg("path", { d: PATHS[name] }));
 }
 
-/** Return a function that schedules `callback` before the next drawing; repeated calls run it once. */
+/** Return a function that schedules `callback` before the next drawing. Repeated calls schedule it only once. */
 export function beforeDrawing(callback) {
-  let requested = false;
+  let isRequested = false;
   return () => {
-    if (requested) return;
-    requested = true;
+    if (isRequested) return;
+    isRequested = true;
     requestAnimationFrame(() => {
-      requested = false;
+      isRequested = false;
       callback();
     });
   };

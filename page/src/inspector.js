@@ -1,4 +1,4 @@
-// The selected track: class, numbers, actions, silhouettes.
+// Inspector of the selected track: class, box values, buttons, silhouettes.
 
 import { getJson } from "./api.js";
 import { getClassColour } from "./colours.js";
@@ -9,7 +9,7 @@ import { on, getSelectedBox, getSelectedTrack, store } from "./store.js";
 
 const FIELDS = [["x", "m"], ["y", "m"], ["z", "m"], ["length", "m"], ["width", "m"],
                 ["height", "m"], ["yaw", "°"]];
-const KINDS = { key: "set by hand", proposed: "proposed", interpolated: "interpolated" };
+const KIND_TITLES = { key: "key box", proposed: "proposed", interpolated: "interpolated" };
 const panel = document.getElementById("inspector");
 const emptyHint = document.getElementById("nothing-selected");
 const getField = (name) => document.getElementById(`field-${name}`);
@@ -19,9 +19,9 @@ const BUTTONS = [
   ["Snap", [["cluster", "C", "Snap to the L-shape of its cluster", () => snap("cluster")],
             ["ground", "G", "Snap to the ground", () => snap("ground")],
             ["size", "T", "Snap to the size of the track", () => snap("size")]]],
-  ["Box", [["copy", "V", "Copy to the next frame, and go there", copyToNextFrame],
-           ["interpolate", "I", "Interpolate between the boxes set by hand before and after", interpolate],
-           ["remove", "Del", "Remove the box of this frame", removeBox]]],
+  ["Box", [["copy", "V", "Copy the box to the next frame, and go to that frame", copyToNextFrame],
+           ["interpolate", "I", "Interpolate between the previous and the next key box", interpolate],
+           ["remove", "Del", "Remove the box in this frame", removeBox]]],
   ["Track", [["merge", "M", "Merge with the tracks selected by Ctrl+click", merge],
              ["split", "X", "Split: this frame and later ones become a new track", split],
              ["begin", "Q", "The track starts here: remove boxes before this frame", () => trim("before")],
@@ -54,28 +54,28 @@ export function openInspector() {
     await setTrackClass(choice.value);
     update(); // show the saved class if saving failed
   };
-  document.getElementById("accept").onclick = () => decideTrack(toggleVerb("accepted", "accept"));
-  document.getElementById("reject").onclick = () => decideTrack(toggleVerb("rejected", "reject"));
+  document.getElementById("accept").onclick = () => decideTrack(toggleDecision("accepted", "accept"));
+  document.getElementById("reject").onclick = () => decideTrack(toggleDecision("rejected", "reject"));
   on("drive", fillClasses);
   on("selection tracks draft drive", update);
-  on("frame", discardInput); // it belongs to the box of the previous frame
+  on("frame", discardInput); // the input belongs to the box in the previous frame
   on("selection tracks frame", loadSilhouettes);
 }
 
-const toggleVerb = (state, verb) => getSelectedTrack()?.state === state ? "reopen" : verb;
+const toggleDecision = (state, decision) => getSelectedTrack()?.state === state ? "reopen" : decision;
 
 function fillClasses() {
   document.getElementById("class").replaceChildren(...store.drive.classes.map(({ name }, k) =>
     element("option", { value: name }, k < 9 ? `${k + 1}  ${name}` : name)));
 }
 
-/** Save one number of the box; the others keep the digits that the fields do not show. */
+/** Save one number of the box. The other numbers keep their full precision, which the fields do not show. */
 async function saveNumber(k, input) {
   editedField = null;
   const box = getSelectedBox()?.box.slice(), value = input.valueAsNumber; // NaN if empty
   if (box && Number.isFinite(value) && (value > 0 || k < 3 || k === 6)) {
     box[k] = k === 6 ? value * Math.PI / 180 : value;
-    setDraft(box); // so that the next number is added to this one
+    setDraft(box); // so that the next input is applied to this box
     await commitDraft();
   }
   update();
@@ -108,7 +108,7 @@ function update() {
   choice.value = track.class;
   const selectedBox = getSelectedBox();
   document.getElementById("kind").textContent = selectedBox === null ? "no box in this frame"
-    : store.mode === "view" ? "" : KINDS[selectedBox.kind];
+    : store.mode === "view" ? "" : KIND_TITLES[selectedBox.kind];
   document.getElementById("accept").setAttribute("aria-pressed", track.state === "accepted");
   document.getElementById("reject").setAttribute("aria-pressed", track.state === "rejected");
   updateNumbers(selectedBox?.box);
@@ -123,7 +123,7 @@ function updateNumbers(box) {
   }
 }
 
-/** Show a selected label or detection. */
+/** Show the selected label or detection. */
 function showResult({ layer, row, error, colour }) {
   document.getElementById("who").textContent = row[7];
   const badge = document.getElementById("state");
@@ -134,7 +134,7 @@ function showResult({ layer, row, error, colour }) {
   updateNumbers(row);
 }
 
-/** List further facts about a track, label or detection: [name, value]. */
+/** List further facts about a track, label or detection, as [name, value]. */
 function listFacts(track, selectedResult) {
   if (track) {
     return [["source", track.source], ["score", track.score.toFixed(2)],
@@ -153,7 +153,7 @@ function listFacts(track, selectedResult) {
   return facts;
 }
 
-/** Find the track of the same class at a detection. Returns its id, or null. */
+/** Find the nearest track with the class and position of a detection. Returns its id, or null. */
 function findTrackAt(row) {
   let nearest = null, minDistance = Math.max(1, row[3] / 2);
   for (const track of store.tracks.values()) {
@@ -178,7 +178,7 @@ function loadSilhouettes() {
     let silhouettes = null;
     try {
       silhouettes = await getJson(`/api/silhouettes?frame=${store.frame}&track=${track.id}`);
-    } catch { /* no seed yet, or nothing to compare */ }
+    } catch { /* there is no seed, or the box has too few points */ }
     if (requestedKey !== key) return;
     area.hidden = silhouettes === null;
     if (silhouettes === null) return;

@@ -1,5 +1,5 @@
-// View of a running graph: shows the newest frame at most ten times per second; while paused, the user
-// can step through the stored frames.
+// View of a running graph. It shows the newest frame, at most ten times per second. While it is paused,
+// the user can step through the stored frames.
 
 import { sendCommand } from "./api.js";
 import { goTo } from "./cloud.js";
@@ -37,19 +37,19 @@ function showWarnings() {
   warnings.replaceChildren(...lines.map((line) => element("span", {}, line)));
 }
 
-/** List statistics of the clouds and of each topic with boxes: [title, value, tooltip, problem]. */
+/** List the statistics of the clouds and of each topic with boxes, as [title, value, tooltip, problem]. */
 export function listReceptionRows() {
   const { clouds = {}, topics = [] } = store.status ?? {};
   const rows = [["clouds per second", clouds.rate_hz ?? "–", clouds.topic ?? ""],
     ["lost · dropped", `${clouds.lost ?? 0} · ${clouds.dropped ?? 0}`,
-     "Lost in transport; dropped because newer clouds were waiting"]];
+     "Clouds lost in transport, and clouds dropped because newer ones were waiting"]];
   if (clouds.skipped) rows.push(["skipped", `${clouds.skipped}`, "Clouds that arrived while a page was paused"]);
   for (const { topic, kind, received, late, unmatched, ms } of topics) {
     const name = kind === "labels" ? "labels" : topic.replace(/^\/|\/output\/\w+$/g, "");
     const problems = [late ? `${late} late` : null, unmatched ? `${unmatched} without a cloud` : null];
     rows.push([kind === "tracks" ? `${name}: tracks` : name,
       !received ? "none yet" : ms === null || kind === "labels" ? `${received}` : `${received} · ${ms} ms`,
-      `${topic}: number of arrays, and their delay behind the cloud. Late: after it was shown`,
+      `${topic}: number of arrays and median delay after the cloud. Late arrays arrive after the cloud is shown`,
       problems.filter(Boolean).join(" · ")]);
   }
   return rows;

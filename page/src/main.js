@@ -1,4 +1,4 @@
-// Entry point: opens the parts of the page in order, then loads the drive.
+// Entry point: opens the parts of the page, then loads the drive.
 
 import { listen, loadDrive, loadState } from "./api.js";
 import "./boxes3d.js";
@@ -49,12 +49,12 @@ async function open() {
   openLive();
   if (query.has("track")) select(Number(query.get("track")));
   await loadResults();
-  notify("tracks"); // redraw, now that everything is loaded
+  notify("tracks"); // redraw after everything is loaded
   requestAnimationFrame(() => requestAnimationFrame(() => {
     document.documentElement.dataset.ready = "true";
   }));
 }
 
-// For measurements, screenshots and tests; the page itself does not use it.
+// Access for tests, screenshots and measurements. The page itself does not use it.
 globalThis.page = { store, draw, drawStats, findPointAt, project, moveCamera, limits, lookAt };
 open();

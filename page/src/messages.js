@@ -1,4 +1,4 @@
-// Short messages at the edge of the view, and the log of all messages.
+// Short messages (toasts) at the edge of the view, and the log of all messages.
 
 import { element, icon } from "./dom.js";
 

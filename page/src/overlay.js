@@ -1,4 +1,4 @@
-// Overlay of the 3D view: handles of the selected box, names of boxes.
+// Overlay of the 3D view with the handles of the selected box and the names of boxes.
 
 import { computeAxis, intersectLevel, translate, moveFace, findNearestOnLine, toWorld, rotate } from "./boxmath.js";
 import { getClassColour, listShownBoxes } from "./colours.js";
@@ -15,26 +15,26 @@ const FACES = [["+x", "front"], ["-x", "back"], ["+y", "left side"], ["-y", "rig
                ["+z", "top"], ["-z", "bottom"]];
 const AXES = { x: 0, y: 1, z: 2 };
 
-export const CLICK_RADIUS = 4; // pixels; a longer movement is a drag
-const MIN_SIZE_PX = 34; // the handles would hide a smaller box
+export const CLICK_RADIUS_PX = 4; // a longer movement of the pointer is a drag
+const MIN_SIZE_PX = 34; // smaller boxes get no handles, which would hide them
 const ring = svg("path", { class: "ring" });
-const grip = svg("path", { class: "ringgrip", "data-handle": "yaw" }, svg("title", {}, "Drag to turn"));
+const grip = svg("path", { class: "ringgrip", "data-handle": "yaw" }, svg("title", {}, "Drag to rotate"));
 const stalk = svg("path", { class: "stalk" });
 const knob = svg("circle", { class: "handle turn", r: 7, "data-handle": "yaw" },
-  svg("title", {}, "Drag to turn"));
+  svg("title", {}, "Drag to rotate"));
 const faces = FACES.map(([name, faceName]) => svg("circle", { class: "handle face", r: 6,
-  "data-handle": name }, svg("title", {}, `Drag to move only the ${faceName}`)));
+  "data-handle": name }, svg("title", {}, `Drag to move the ${faceName}`)));
 layer.append(ring, grip, stalk, ...faces, knob);
 
 const computeRingRadius = (box) => Math.hypot(box[3], box[4]) / 2 + 0.35;
 const toPath = (points) => points.some((p) => !p) ? ""
   : `M${points.map((p) => p.map((v) => v.toFixed(1)).join(" ")).join("L")}`;
 
-function placeHandle(handle, at) {
-  handle.style.display = at ? "" : "none";
-  if (at) {
-    handle.setAttribute("cx", at[0].toFixed(1));
-    handle.setAttribute("cy", at[1].toFixed(1));
+function placeHandle(handle, position) {
+  handle.style.display = position ? "" : "none";
+  if (position) {
+    handle.setAttribute("cx", position[0].toFixed(1));
+    handle.setAttribute("cy", position[1].toFixed(1));
   }
 }
 
@@ -69,8 +69,8 @@ function placeHandles() {
 
 function placeNames() {
   const candidates = [];
-  const withTracks = store.mode === "label" || store.layers.tracks;
-  for (const { track, box } of withTracks ? listShownBoxes() : []) {
+  const showsTracks = store.mode === "label" || store.layers.tracks;
+  for (const { track, box } of showsTracks ? listShownBoxes() : []) {
     const isSelected = track.id === store.selected;
     if (!store.showNames && !isSelected && track.id !== store.hover) continue;
     candidates.push({ box, isSelected, colour: getClassColour(track.class), state: track.state,
@@ -90,7 +90,7 @@ function placeNames() {
   }
 }
 
-/** Select names that do not overlap: the selected box first, then errors, then the nearest. */
+/** Select names that do not overlap. The selected box has priority, then errors, then near boxes. */
 function selectNames(candidates) {
   const rank = (entry) => (entry.isSelected ? 0 : entry.emphasized ? 1000 : 2000) + entry.distance;
   const shown = [];
@@ -108,20 +108,20 @@ function selectNames(candidates) {
 }
 afterDrawing.push(placeHandles, placeNames);
 
-/** Start a drag: call move(event) for each step, and commit the draft at the end. Escape, another
- * selection or another frame cancels it; a movement within CLICK_RADIUS does nothing. */
+/** Start a drag: call move(event) for each step, and commit the draft at the end. The drag is cancelled by
+ * Escape, or if the selection or the frame changes. A movement within CLICK_RADIUS_PX has no effect. */
 export function startDrag(target, event, move) {
   target.setPointerCapture(event.pointerId);
   controls.enabled = false;
   const { selected, frame } = store, { clientX, clientY } = event;
-  let cancelled = false, moved = false;
+  let isCancelled = false, hasMoved = false;
   const step = (e) => {
-    moved ||= Math.hypot(e.clientX - clientX, e.clientY - clientY) > CLICK_RADIUS;
-    if (!cancelled && (store.selected !== selected || store.frame !== frame)) {
-      cancelled = true;
+    hasMoved ||= Math.hypot(e.clientX - clientX, e.clientY - clientY) > CLICK_RADIUS_PX;
+    if (!isCancelled && (store.selected !== selected || store.frame !== frame)) {
+      isCancelled = true;
       dropDraft();
     }
-    if (!cancelled && moved) move(e);
+    if (!isCancelled && hasMoved) move(e);
   };
   const stop = (e) => {
     target.removeEventListener("pointermove", step);
@@ -129,13 +129,13 @@ export function startDrag(target, event, move) {
     target.removeEventListener("pointercancel", stop);
     removeEventListener("keydown", escape, true);
     controls.enabled = true;
-    if (cancelled || e.type === "pointercancel") dropDraft();
+    if (isCancelled || e.type === "pointercancel") dropDraft();
     else commitDraft();
   };
   const escape = (e) => {
     if (e.key !== "Escape") return;
     e.stopPropagation();
-    cancelled = true;
+    isCancelled = true;
     dropDraft();
   };
   target.addEventListener("pointermove", step);
@@ -144,46 +144,46 @@ export function startDrag(target, event, move) {
   addEventListener("keydown", escape, true);
 }
 
-// Drag a face along its own axis, or the ring around the box.
+// Drag a face of the box along its normal, or rotate the box by dragging the ring around it.
 layer.addEventListener("pointerdown", (event) => {
   const name = event.target.dataset?.handle, start = getSelectedBox()?.box;
   if (!name || !start || event.button !== 0) return;
   event.preventDefault();
-  const from = castRay(event.clientX, event.clientY);
+  const startRay = castRay(event.clientX, event.clientY);
   if (name === "yaw") {
     const computeAngle = ({ origin, direction }) => {
-      const at = intersectLevel(origin, direction, start[2] - start[5] / 2);
-      return at && Math.atan2(at[1] - start[1], at[0] - start[0]);
+      const point = intersectLevel(origin, direction, start[2] - start[5] / 2);
+      return point && Math.atan2(point[1] - start[1], point[0] - start[0]);
     };
-    const first = computeAngle(from);
+    const startAngle = computeAngle(startRay);
     startDrag(event.target, event, (e) => {
-      const current = computeAngle(castRay(e.clientX, e.clientY));
-      if (first !== null && current !== null) setDraft(rotate(start, current - first));
+      const angle = computeAngle(castRay(e.clientX, e.clientY));
+      if (startAngle !== null && angle !== null) setDraft(rotate(start, angle - startAngle));
     });
     return;
   }
   const axis = AXES[name[1]], sign = name[0] === "+" ? 1 : -1;
-  const along = computeAxis(start, axis).map((v) => v * sign);
+  const normal = computeAxis(start, axis).map((v) => v * sign);
   const local = [0, 0, 0];
   local[axis] = sign * start[3 + axis] / 2;
   const centre = toWorld(start, ...local);
-  const first = findNearestOnLine(centre, along, from.origin, from.direction);
+  const startOffset = findNearestOnLine(centre, normal, startRay.origin, startRay.direction);
   startDrag(event.target, event, (e) => {
     const { origin, direction } = castRay(e.clientX, e.clientY);
-    const current = findNearestOnLine(centre, along, origin, direction);
-    if (first !== null && current !== null) setDraft(moveFace(start, axis, sign, current - first));
+    const offset = findNearestOnLine(centre, normal, origin, direction);
+    if (startOffset !== null && offset !== null) setDraft(moveFace(start, axis, sign, offset - startOffset));
   });
 });
 
 /** Drag the selected box horizontally, at the height of its centre. */
 export function dragBody(target, event) {
-  const start = getSelectedBox()?.box, from = castRay(event.clientX, event.clientY);
-  const first = intersectLevel(from.origin, from.direction, start[2]);
-  if (!getSelectedTrack() || !first) return false;
+  const start = getSelectedBox()?.box, startRay = castRay(event.clientX, event.clientY);
+  const startPoint = intersectLevel(startRay.origin, startRay.direction, start[2]);
+  if (!getSelectedTrack() || !startPoint) return false;
   startDrag(target, event, (e) => {
     const { origin, direction } = castRay(e.clientX, e.clientY);
-    const current = intersectLevel(origin, direction, start[2]);
-    if (current) setDraft(translate(start, current[0] - first[0], current[1] - first[1], 0));
+    const point = intersectLevel(origin, direction, start[2]);
+    if (point) setDraft(translate(start, point[0] - startPoint[0], point[1] - startPoint[1], 0));
   });
   return true;
 }

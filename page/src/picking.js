@@ -10,7 +10,7 @@ import { on, store } from "./store.js";
 const PICK_RADIUS_PX = 9;
 const vector = new THREE.Vector3(), matrix = new THREE.Matrix4();
 
-/** Return the ray through a position on the page: {origin, direction}. */
+/** Return the ray {origin, direction} through a position on the page. */
 export function castRay(clientX, clientY) {
   const area = renderer.domElement.getBoundingClientRect();
   vector.set((clientX - area.left) / area.width * 2 - 1, 1 - (clientY - area.top) / area.height * 2, 0.5)
@@ -18,7 +18,7 @@ export function castRay(clientX, clientY) {
   return { origin: camera.position.toArray(), direction: vector.toArray() };
 }
 
-/** Project a point of the sensor's frame to pixels; null behind the camera. */
+/** Project a point in the sensor frame to pixels. Returns null if it is behind the camera. */
 export function project(x, y, z) {
   const area = renderer.domElement;
   vector.set(x, y, z).applyMatrix4(camera.matrixWorldInverse);
@@ -29,17 +29,17 @@ export function project(x, y, z) {
 
 /** Return the index of the point under the pointer, or -1.
  *
- * It is the point nearest to the camera among those within PICK_RADIUS_PX, unless one slightly behind
- * is nearer to the pointer. Testing all points costs less than building a tree for every frame. */
+ * Among the points within PICK_RADIUS_PX, it is the point nearest to the camera, unless a point slightly
+ * behind it is nearer to the pointer. Testing all points is faster than building a tree for every frame. */
 export function findPointAt(clientX, clientY) {
   const { cloud } = store;
   if (!cloud) return -1;
   const area = renderer.domElement.getBoundingClientRect();
   const m = matrix.multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse).elements;
-  const [a, b, c, d] = [m[3], m[7], m[11], m[15]]; // gives the depth
-  // Gives the offset from the pointer in units of PICK_RADIUS_PX, times the depth.
-  const projectOffset = (row, at, half) => [0, 1, 2, 3].map((k) =>
-    (m[row + 4 * k] - at * m[3 + 4 * k]) * half / PICK_RADIUS_PX);
+  const [a, b, c, d] = [m[3], m[7], m[11], m[15]]; // coefficients of the depth
+  // Coefficients of the offset from the pointer in units of PICK_RADIUS_PX, multiplied by the depth.
+  const projectOffset = (row, pointer, halfSize) => [0, 1, 2, 3].map((k) =>
+    (m[row + 4 * k] - pointer * m[3 + 4 * k]) * halfSize / PICK_RADIUS_PX);
   const [ax, bx, cx, dx] = projectOffset(0, (clientX - area.left) / area.width * 2 - 1, area.width / 2);
   const [ay, by, cy, dy] = projectOffset(1, 1 - (clientY - area.top) / area.height * 2, area.height / 2);
   const { xyz, count, ground } = cloud, { near } = camera;
@@ -56,13 +56,13 @@ export function findPointAt(clientX, clientY) {
   return nearest;
 }
 
-/** Find the nearest box under the pointer: {track, result}, the id of a track, or a label or
- * detection. Both are null where there is no box. */
+/** Find the nearest box under the pointer. Returns {track, result} with a track id, or a label or detection;
+ * both are null if there is no box. */
 export function findBoxAt(clientX, clientY) {
-  const { origin, direction } = castRay(clientX, clientY), view = store.mode === "view";
-  const boxes = view && !store.layers.tracks ? [] : listShownBoxes();
+  const { origin, direction } = castRay(clientX, clientY), isView = store.mode === "view";
+  const boxes = isView && !store.layers.tracks ? [] : listShownBoxes();
   let nearest = { track: null, result: null }, minDistance = Infinity;
-  for (const entry of view ? [...boxes, ...listShownResults()] : boxes) {
+  for (const entry of isView ? [...boxes, ...listShownResults()] : boxes) {
     const distance = intersectBox(origin, direction, entry.box);
     if (distance === null || distance >= minDistance) continue;
     minDistance = distance;
@@ -71,10 +71,10 @@ export function findBoxAt(clientX, clientY) {
   return nearest;
 }
 
-const WARM_UP_PICKS = 4; // picks until the browser has compiled the loop
+const WARM_UP_PICKS = 4; // number of picks after which the browser has compiled the loop
 let warmUpCount = 0;
 
-/** Pick while idle: the first picks take ten times as long as later ones. */
+/** Pick while the page is idle, because the first picks take ten times as long as later ones. */
 function warmUp() {
   if (!store.cloud?.count || warmUpCount >= WARM_UP_PICKS) return;
   const area = renderer.domElement.getBoundingClientRect();

@@ -1,4 +1,4 @@
-// Playback at 10 Hz, or slower if frames load slower.
+// Playback at 10 Hz, or slower if frames do not load fast enough.
 
 import { loadCloud, goTo } from "./cloud.js";
 import { pauseLive } from "./live.js";

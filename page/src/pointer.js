@@ -1,9 +1,9 @@
-// The pointer in the 3D view: select, drag, click a seed, add a box.
+// Pointer events in the 3D view: select and drag boxes, click seeds, add boxes.
 
 import { intersectBox } from "./boxmath.js";
-import { addAt, seedAt } from "./edits.js";
+import { addBox, addSeed } from "./edits.js";
 import { showNote } from "./messages.js";
-import { CLICK_RADIUS, dragBody } from "./overlay.js";
+import { CLICK_RADIUS_PX, dragBody } from "./overlay.js";
 import { findBoxAt, findPointAt, castRay } from "./picking.js";
 import { controls, highlightCluster, renderer } from "./scene.js";
 import { notify, on, select, selectResult, getSelectedBox, store } from "./store.js";
@@ -11,14 +11,14 @@ import { notify, on, select, selectResult, getSelectedBox, store } from "./store
 const canvas = renderer.domElement;
 let pressedAt = null, hoverRequest = 0;
 
-// Capture the event before the camera's own listeners, so that a box can be dragged instead.
+// Capture the event before the listeners of the camera, so that a box can be dragged.
 canvas.addEventListener("pointerdown", (event) => {
   canvas.focus({ preventScroll: true });
   if (event.button !== 0) return;
   pressedAt = [event.clientX, event.clientY];
   const box = getSelectedBox()?.box;
-  const withoutModifiers = !event.ctrlKey && !event.metaKey && !event.shiftKey;
-  if (store.mode !== "label" || store.tool !== "select" || !box || !withoutModifiers) return;
+  const hasNoModifiers = !event.ctrlKey && !event.metaKey && !event.shiftKey;
+  if (store.mode !== "label" || store.tool !== "select" || !box || !hasNoModifiers) return;
   const { origin, direction } = castRay(event.clientX, event.clientY);
   if (intersectBox(origin, direction, box) === null) return;
   if (dragBody(canvas, event)) event.stopImmediatePropagation();
@@ -26,26 +26,26 @@ canvas.addEventListener("pointerdown", (event) => {
 
 canvas.addEventListener("pointerup", (event) => {
   if (!pressedAt || event.button !== 0) return;
-  const moved = Math.hypot(event.clientX - pressedAt[0], event.clientY - pressedAt[1]);
+  const distance = Math.hypot(event.clientX - pressedAt[0], event.clientY - pressedAt[1]);
   pressedAt = null;
-  if (moved <= CLICK_RADIUS) click(event);
+  if (distance <= CLICK_RADIUS_PX) click(event);
 });
 
 function click(event) {
   if (store.tool === "select") {
     const { track, result } = findBoxAt(event.clientX, event.clientY);
     if (result) selectResult(result);
-    else select(track, { more: event.ctrlKey || event.metaKey });
+    else select(track, { extend: event.ctrlKey || event.metaKey });
     return;
   }
   const index = findPointAt(event.clientX, event.clientY);
   if (index < 0) {
-    showNote("There is no point here; click one of the object's points.");
+    showNote("No point under the pointer. Click a point of the object.");
     return;
   }
   const xyz = [...store.cloud.xyz.subarray(3 * index, 3 * index + 3)];
-  if (store.tool === "seed") seedAt(xyz);
-  else addAt(xyz);
+  if (store.tool === "seed") addSeed(xyz);
+  else addBox(xyz);
 }
 
 canvas.addEventListener("pointermove", (event) => {
@@ -82,7 +82,7 @@ export function setTool(tool) {
   notify("tool");
 }
 
-/** Click in the middle of the view, for use without a mouse. */
+/** Click at the centre of the view, for use without a mouse. */
 export function clickCentre() {
   const area = canvas.getBoundingClientRect();
   click({ clientX: area.left + area.width / 2, clientY: area.top + area.height / 2 });

@@ -1,11 +1,11 @@
-// The cloud in the 3D view. Without a GPU, drawing all points takes 0.1 s. So their image and depth are
+// The cloud in the 3D view. Without a GPU, drawing all points takes 0.1 s. Their image and depth are therefore
 // cached while the camera stands still, and everything else is drawn over the cached image.
 
 import * as THREE from "three";
 import { HIGHLIGHT, paintCloud, rgb, getTheme } from "./colours.js";
 import { store } from "./store.js";
 
-const size = { value: 2 }; // pixels of a distant point
+const size = { value: 2 }; // size of a distant point in pixels
 const vertexShader = `attribute vec4 colour; uniform float size, depthOffset; varying vec3 shade;
   void main() { shade = colour.rgb; gl_Position = projectionMatrix * modelViewMatrix
     * vec4(position, 1.0); gl_Position.z -= depthOffset * gl_Position.w;
@@ -28,7 +28,7 @@ const cachedImage = new THREE.Mesh(new THREE.PlaneGeometry(2, 2), new THREE.Shad
       gl_FragColor = texelFetch(colour, at, 0); gl_FragDepth = far; }`,
   depthFunc: THREE.AlwaysDepth,
 }));
-cachedImage.renderOrder = -1; // first, for correct depth tests
+cachedImage.renderOrder = -1; // drawn first, so that depth tests are correct
 
 let shownCloud = null, highlightedCluster = 0, paintCount = 0, maxPoints = Infinity, cacheKey = "";
 
@@ -39,7 +39,7 @@ export function openPoints(scene) {
   }
 }
 
-/** Show the cloud of the frame, coloured. */
+/** Show the cloud of the frame in the current colour scheme. */
 export function setPoints() {
   const { cloud } = store;
   if (cloud !== shownCloud) {
@@ -54,7 +54,7 @@ export function setPoints() {
   paintCount += 1;
 }
 
-/** Highlight the points of one cluster; 0 for none. Returns true if the highlight changed. */
+/** Highlight the points of one cluster, or none if it is 0. Returns true if the highlight has changed. */
 export function highlightPoints(cluster) {
   if (cluster === highlightedCluster) return false;
   highlightedCluster = cluster;
@@ -75,15 +75,16 @@ function setGeometry(object, xyz, colours) {
   object.geometry.setAttribute("colour", new THREE.BufferAttribute(colours, 4, true));
 }
 
-/** Draw only the first `count` points of this and later clouds; their order is random. */
+/** Draw only the first `count` points of this and later clouds. The points are in random order. */
 export function limitPoints(count) {
   maxPoints = count;
   points.geometry.setDrawRange(0, count);
 }
-export const pointCount = () => Math.min(points.geometry.drawRange.count, shownCloud?.count ?? 0);
+export const getPointCount = () => Math.min(points.geometry.drawRange.count, shownCloud?.count ?? 0);
 export const setPointSize = (pixels) => { size.value = pixels; };
 
-/** Draw the scene. useCache: draw the cached image of the points, updated if they or the view changed. */
+/** Draw the scene. If useCache is true, the points are drawn from a cached image, which is updated if the
+ * points or the view have changed. */
 export function render(renderer, scene, camera, useCache) {
   cachedImage.visible = useCache;
   points.visible = !useCache;
@@ -94,7 +95,7 @@ export function render(renderer, scene, camera, useCache) {
 function updateCachedImage(renderer, camera) {
   const { width, height } = renderer.domElement;
   camera.updateMatrixWorld();
-  const key = [paintCount, pointCount(), width, height, size.value, ...camera.matrixWorld.elements,
+  const key = [paintCount, getPointCount(), width, height, size.value, ...camera.matrixWorld.elements,
                ...camera.projectionMatrix.elements].join(" ");
   if (key === cacheKey) return;
   cacheKey = key;

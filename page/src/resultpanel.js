@@ -1,14 +1,15 @@
-// The panel of view mode: layers, score threshold, and counts of missed and false boxes.
+// Panel of view mode with layers, minimum score, and counts of misses and false positives.
 
 import { goTo } from "./cloud.js";
 import { element } from "./dom.js";
 import { listReceptionRows } from "./live.js";
 import { showNote, showError } from "./messages.js";
-import { listResultBoxes, FALSE, loadResults, MISSED, reloadResults, countResults, fetchResults } from "./results.js";
+import { countResults, FALSE_POSITIVE_COLOUR, fetchResults, LABEL_COLOUR, listResultBoxes, loadResults, MISS_COLOUR,
+         reloadResults } from "./results.js";
 import { notify, on, selectResult, store } from "./store.js";
 
-const LAYERS = [["labels", "Labels", "#94a3b8"], ["errors", "Missed and false", MISSED],
-                ["tracks", "Tracks", null], ["trails", "Trails of tracks", null]];
+const LAYERS = [["labels", "Labels", LABEL_COLOUR], ["errors", "Misses and false positives", MISS_COLOUR],
+                ["tracks", "Tracks", null], ["trails", "Track trails", null]];
 const panel = document.getElementById("results");
 
 function makeCheckbox(name, title, colour, value, set) {
@@ -41,33 +42,36 @@ function build() {
   showReception();
 }
 
-const makeCountRow = (title, value, colour, tooltip, makePart) => element("div",
-  { class: `count-row${makePart ? " part" : ""}`, title: tooltip },
+const makeCountRow = (title, value, colour, tooltip, isPart) => element("div",
+  { class: `count-row${isPart ? " part" : ""}`, title: tooltip },
   element("span", {}, title), element("b", { style: colour ? `color:${colour}` : "" },
     value === null ? "–" : String(value)));
 
 function showReception() {
   document.getElementById("reception")?.replaceChildren(...listReceptionRows().flatMap(
     ([title, value, tooltip, problem]) => [makeCountRow(title, value, "", tooltip),
-      ...(problem ? [makeCountRow("", problem, FALSE, tooltip)] : [])]));
+      ...(problem ? [makeCountRow("", problem, FALSE_POSITIVE_COLOUR, tooltip)] : [])]));
 }
 
 function showCounts() {
   const counts = document.getElementById("counts");
   if (!counts) return;
-  const { source, labels, hits, missed, ignoredLabels, detected, false: falseCount, ignored } = countResults();
+  const { source, labels, matched, missed, ignoredLabels, detections, falsePositives, ignored } = countResults();
   const makePart = (title, value, colour, tooltip = "") => makeCountRow(title, value, colour, tooltip, true);
-  counts.replaceChildren(makeCountRow("labels", labels, "", "Found, missed and ignored labels"),
-    makePart("found", hits, ""), makePart("missed", missed, missed ? MISSED : ""),
+  counts.replaceChildren(makeCountRow("labels", labels, "", "Detected, missed and ignored labels"),
+    makePart("detected", matched, ""), makePart("missed", missed, missed ? MISS_COLOUR : ""),
     makePart("ignored", ignoredLabels, "", "Labels of classes that are not scored, such as vans"),
-    makeCountRow(source ? `by ${source}` : "detections", detected, "", "Correct, false and ignored detections"),
-    makePart("correct", hits, ""), makePart("false", falseCount, falseCount ? FALSE : ""),
-    makePart("ignored", ignored, "", "On ignored labels, or outside the camera image, where nothing is labelled"));
+    makeCountRow(source ? `detections by ${source}` : "detections", detections, "",
+                 "True positives, false positives and ignored detections"),
+    makePart("true positives", matched, ""),
+    makePart("false positives", falsePositives, falsePositives ? FALSE_POSITIVE_COLOUR : ""),
+    makePart("ignored", ignored, "",
+             "Detections that match ignored labels, or outside the camera image, where no objects are labelled"));
 }
 
 let lastSearch = 0;
 
-/** Go to the next (1) or previous (-1) missed label or false detection, in this or another frame. */
+/** Go to the next (1) or previous (-1) miss or false positive, in this or another frame. */
 export async function goToError(step) {
   const searchNumber = ++lastSearch, { frames, first } = store.drive;
   const listErrors = (results, frame) => listResultBoxes(results, frame).filter(({ error }) => error);
@@ -78,7 +82,7 @@ export async function goToError(step) {
     while (!errors[index]) {
       frame += step;
       if (frame < first || frame >= frames.length) {
-        showNote(`No missed label or false detection ${step > 0 ? "after" : "before"} this one.`);
+        showNote(`No ${step > 0 ? "further" : "earlier"} miss or false positive.`);
         return;
       }
       errors = listErrors(await fetchResults(frame), frame);

@@ -1,19 +1,19 @@
-// The 3D view: one cloud, the boxes, a camera. It is drawn only after changes.
+// The 3D view with a cloud, boxes and a camera. It is drawn only after changes.
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { getTheme } from "./colours.js";
 import { beforeDrawing } from "./dom.js";
-import { highlightPoints, openPoints, pointCount, render, setPointSize, setPoints, limitPoints } from "./points.js";
+import { highlightPoints, openPoints, getPointCount, render, setPointSize, setPoints, limitPoints } from "./points.js";
 import { on, getSelectedBox, store } from "./store.js";
 
-export const limits = { movingPoints: 30_000 }; // points drawn while the camera moves, in random order
-const REST_MS = 160;
+export const limits = { movingPoints: 30_000 }; // number of random points to draw while the camera moves
+const REST_MS = 160; // the camera stands still if it has not moved for this time
 const BACKGROUND = { dark: 0x11151c, light: 0xf5f7fa };
-const RINGS = [10, 20, 40, 60, 80];
+const RING_RADII_M = [10, 20, 40, 60, 80];
 
-const canvas = document.getElementById("scene"), software = isSoftwareRendered();
-export const renderer = new THREE.WebGLRenderer({ canvas, antialias: !software });
+const canvas = document.getElementById("scene"), isSoftware = isSoftwareRendered();
+export const renderer = new THREE.WebGLRenderer({ canvas, antialias: !isSoftware });
 export const scene = new THREE.Scene();
 export const camera = new THREE.PerspectiveCamera(50, 1, 0.3, 600);
 camera.up.set(0, 0, 1);
@@ -30,7 +30,7 @@ const rings = new THREE.LineSegments(new THREE.BufferGeometry(),
 rings.frustumCulled = false;
 scene.add(rings);
 
-/** Return true without a GPU, where antialiasing would take two thirds of the drawing time. */
+/** Return true if there is no GPU. Antialiasing would then take two thirds of the drawing time. */
 function isSoftwareRendered() {
   const gl = document.createElement("canvas").getContext("webgl2");
   const extension = gl?.getExtension("WEBGL_debug_renderer_info");
@@ -41,17 +41,17 @@ function isSoftwareRendered() {
 
 /** Functions that are called after each drawing, for overlays. */
 export const afterDrawing = [];
-export const drawStats = { ms: 0, count: 0, points: 0 }; // the last drawing, for measurements
+export const drawStats = { ms: 0, count: 0, points: 0 }; // statistics of the last drawing, for page/measure.py
 
 let restTimer = 0, isCameraStill = true;
 
 export const draw = beforeDrawing(() => {
   const start = performance.now();
-  render(renderer, scene, camera, software && isCameraStill && !store.playing);
+  render(renderer, scene, camera, isSoftware && isCameraStill && !store.playing);
   for (const callback of afterDrawing) callback();
   drawStats.ms = performance.now() - start;
   drawStats.count += 1;
-  drawStats.points = pointCount();
+  drawStats.points = getPointCount();
 });
 
 function onCameraMove() {
@@ -64,8 +64,8 @@ controls.addEventListener("change", onCameraMove);
 
 function setMoving(isMoving) {
   isCameraStill = !isMoving;
-  const all = store.cloud?.count ?? 0;
-  limitPoints(isMoving || store.playing ? Math.min(limits.movingPoints, all) : all);
+  const count = store.cloud?.count ?? 0;
+  limitPoints(isMoving || store.playing ? Math.min(limits.movingPoints, count) : count);
   draw();
 }
 
@@ -73,7 +73,7 @@ function setCloud() {
   if (!store.cloud) return;
   setPoints();
   setRings(store.cloud.floor);
-  onCameraMove(); // few points at first, then all of them
+  onCameraMove(); // draws few points first, then all of them
 }
 
 function repaint() {
@@ -82,14 +82,14 @@ function repaint() {
   draw();
 }
 
-/** Highlight one cluster of the cloud; 0 for none. */
+/** Highlight one cluster of the cloud, or none if it is 0. */
 export function highlightCluster(cluster) {
   if (store.cloud && highlightPoints(cluster)) draw();
 }
 
 function setRings(floor) {
   const positions = [];
-  for (const radius of RINGS) {
+  for (const radius of RING_RADII_M) {
     const steps = 96;
     for (let k = 0; k < steps; k++) {
       for (const end of [k, k + 1]) {
@@ -98,7 +98,7 @@ function setRings(floor) {
       }
     }
   }
-  positions.push(0, 0, floor, 3, 0, floor); // the forward direction
+  positions.push(0, 0, floor, 3, 0, floor); // line in the forward direction
   rings.geometry.setAttribute("position", new THREE.Float32BufferAttribute(positions, 3));
 }
 
@@ -130,22 +130,22 @@ export function resetView() {
   draw();
 }
 
-/** Look at `target` from the position `from`, both in the sensor frame. */
-export function lookAt(target, from) {
+/** Look at a target from a position, both in the sensor frame. */
+export function lookAt(target, position) {
   controls.target.fromArray(target);
-  camera.position.fromArray(from);
+  camera.position.fromArray(position);
   controls.update();
   camera.updateMatrixWorld();
   draw();
 }
 
-export function topView() {
+export function showTopView() {
   const { target } = controls;
-  camera.position.set(target.x - 0.01, target.y, target.z + Math.max(20, distance()));
+  camera.position.set(target.x - 0.01, target.y, target.z + Math.max(20, getDistance()));
   controls.update();
 }
 
-/** Zoom in on the selected box, keeping the direction of view. */
+/** Zoom in on the selected box without changing the viewing direction. */
 export function focusSelection() {
   const box = getSelectedBox()?.box;
   if (!box) return;
@@ -158,15 +158,16 @@ export function focusSelection() {
   controls.update();
 }
 
-const distance = () => camera.position.distanceTo(controls.target);
+const getDistance = () => camera.position.distanceTo(controls.target);
 
-/** Move the camera along the ground by multiples of its distance, turn it, or scale its distance. */
-export function moveCamera(right, ahead, turn = 0, distanceScale = 1) {
+/** Move the camera along the ground by fractions of its distance to the target, rotate it around the target,
+ * or scale the distance. */
+export function moveCamera(right, ahead, rotation = 0, distanceScale = 1) {
   const offset = camera.position.clone().sub(controls.target);
   const forward = new THREE.Vector3(-offset.x, -offset.y, 0).normalize();
   const side = new THREE.Vector3(forward.y, -forward.x, 0);
-  controls.target.addScaledVector(forward, ahead * distance()).addScaledVector(side, right * distance());
-  offset.applyAxisAngle(camera.up, turn).multiplyScalar(distanceScale);
+  controls.target.addScaledVector(forward, ahead * getDistance()).addScaledVector(side, right * getDistance());
+  offset.applyAxisAngle(camera.up, rotation).multiplyScalar(distanceScale);
   camera.position.copy(controls.target).add(offset);
   controls.update();
 }

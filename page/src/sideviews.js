@@ -1,5 +1,5 @@
-// Top, side and front view of the selected box, along its own axes, with handles for its faces, its
-// body and its heading. The views do not move during a drag.
+// Top, side and front view of the selected box along its own axes, with handles for its faces, its body and
+// its heading. The views do not move during a drag.
 
 import { moveFace, moveAlongAxes, toLocal, rotate } from "./boxmath.js";
 import { getTheme } from "./colours.js";
@@ -8,22 +8,24 @@ import { setDraft } from "./edits.js";
 import { startDrag } from "./overlay.js";
 import { on, getSelectedBox, store } from "./store.js";
 
-// The local axes that point right and up, and the sign of the first: 0 length, 1 width, 2 height.
+// right, up: axes of the box (0 length, 1 width, 2 height) that point right and up in the view.
+// flip: -1 if the first axis points left instead.
 const VIEWS = [
-  { name: "top", title: "Top", right: 0, up: 1, flip: 1, turns: true },
+  { name: "top", title: "Top", right: 0, up: 1, flip: 1, isRotatable: true },
   { name: "side", title: "Side", right: 0, up: 2, flip: 1 },
-  { name: "front", title: "Front", right: 1, up: 2, flip: -1 }, // seen from the front
+  { name: "front", title: "Front", right: 1, up: 2, flip: -1 },
 ];
 const NAMES = "xyz";
 const POINT_COLOURS = { dark: ["#7f8ea8", "#ffffff", "#3b4558"], light: ["#8794a8", "#0b1220", "#c3ccd8"] };
-const MARGIN_M = 0.6, KNOB_PX = 20; // around the box; from its front to the knob
+const MARGIN_M = 0.6; // margin around the box
+const KNOB_DISTANCE_PX = 20; // distance of the knob from the front of the box
 
-let anchor = null, nearPoints = [], zoom = 1;
+let anchor = null, nearPoints = [], zoom = 1; // the anchor is the box whose axes define the views
 
 function buildView(view) {
   view.canvas = element("canvas");
   view.layer = svg("svg", { class: "handles" });
-  view.ring = svg("line", { class: "stalk" });
+  view.stalk = svg("line", { class: "stalk" });
   view.rect = svg("rect", { class: "body", "data-handle": "move" }, svg("title", {}, "Drag to move"));
   view.front = svg("line", { class: "frontline" });
   view.group = svg("g", {}, view.rect, view.front);
@@ -37,9 +39,9 @@ function buildView(view) {
       view.handles.push({ axis, sign, vertical, grip, dot });
     }
   }
-  view.knob = view.turns ? svg("circle", { class: "handle turn", r: 6, "data-handle": "yaw" },
-                               svg("title", {}, "Drag to turn")) : null;
-  if (view.knob) view.group.append(view.ring, view.knob);
+  view.knob = view.isRotatable ? svg("circle", { class: "handle turn", r: 6, "data-handle": "yaw" },
+                               svg("title", {}, "Drag to rotate")) : null;
+  if (view.knob) view.group.append(view.stalk, view.knob);
   view.layer.append(view.group);
   view.size = element("span", { class: "measure" });
   view.panel = element("figure", { class: "sideview", "data-view": view.name }, view.canvas,
@@ -53,13 +55,13 @@ function buildView(view) {
   return view.panel;
 }
 
-/** Compute the pixels per metre at which the box with its margin fills the view. */
+/** Compute the scale in pixels per metre at which the box and its margin fill the view. */
 function computeScale(view, width, height) {
-  const along = anchor[3 + view.right] + 2 * MARGIN_M, across = anchor[3 + view.up] + 2 * MARGIN_M;
-  return zoom * Math.min(width / along, height / across);
+  const boxWidth = anchor[3 + view.right] + 2 * MARGIN_M, boxHeight = anchor[3 + view.up] + 2 * MARGIN_M;
+  return zoom * Math.min(width / boxWidth, height / boxHeight);
 }
 
-/** Collect the points around the anchor, in its axes: [u, v, w, ground] each. */
+/** Collect the points around the anchor, as [u, v, w, ground] in the axes of the anchor. */
 function collectPoints() {
   nearPoints = [];
   const { cloud } = store;
@@ -68,8 +70,8 @@ function collectPoints() {
   for (let i = 0; i < cloud.count; i++) {
     const x = xyz[3 * i], y = xyz[3 * i + 1];
     if (Math.abs(x - anchor[0]) > radius || Math.abs(y - anchor[1]) > radius) continue;
-    const at = toLocal(anchor, x, y, xyz[3 * i + 2]);
-    if (Math.abs(at[2]) < anchor[5] / 2 + 3) nearPoints.push([...at, cloud.ground[i]]);
+    const local = toLocal(anchor, x, y, xyz[3 * i + 2]);
+    if (Math.abs(local[2]) < anchor[5] / 2 + 3) nearPoints.push([...local, cloud.ground[i]]);
   }
 }
 
@@ -81,7 +83,7 @@ function startViewDrag(view, event) {
   const startAnchor = anchor.slice(), startPixel = [event.clientX, event.clientY];
   const rotation = start[6] - startAnchor[6];
   startDrag(event.target, event, (e) => {
-    let across = (e.clientX - startPixel[0]) / scale * view.flip, up = -(e.clientY - startPixel[1]) / scale;
+    let right = (e.clientX - startPixel[0]) / scale * view.flip, up = -(e.clientY - startPixel[1]) / scale;
     if (name === "yaw") {
       const u = (e.clientX - area.left - area.width / 2) / scale;
       const v = -(e.clientY - area.top - area.height / 2) / scale;
@@ -89,24 +91,24 @@ function startViewDrag(view, event) {
       setDraft(rotate(start, Math.atan2(v - centre[1], u - centre[0]) - rotation));
       return;
     }
-    if (view.turns) { // to the axes of the box, which may be turned in this view
+    if (view.isRotatable) { // convert to the axes of the box, which may be rotated in this view
       const c = Math.cos(rotation), s = Math.sin(rotation);
-      [across, up] = [c * across + s * up, -s * across + c * up];
+      [right, up] = [c * right + s * up, -s * right + c * up];
     }
-    const moved = [0, 0, 0];
-    moved[view.right] = across;
-    moved[view.up] = up;
+    const shift = [0, 0, 0];
+    shift[view.right] = right;
+    shift[view.up] = up;
     if (name === "move") {
-      setDraft(moveAlongAxes(start, ...moved));
+      setDraft(moveAlongAxes(start, ...shift));
     } else {
       const axis = NAMES.indexOf(name[1]), sign = name[0] === "+" ? 1 : -1;
-      setDraft(moveFace(start, axis, sign, moved[axis] * sign));
+      setDraft(moveFace(start, axis, sign, shift[axis] * sign));
     }
   });
 }
 
-/** Return for each collected point whether it is inside a box. */
-function findInside(box) {
+/** Return an array that is true for each collected point inside a box. */
+function findPointsInside(box) {
   const c = Math.cos(box[6] - anchor[6]), s = Math.sin(box[6] - anchor[6]);
   const centre = toLocal(anchor, box[0], box[1], box[2]), [l, w, h] = box.slice(3, 6).map((v) => v / 2);
   return nearPoints.map((point) => {
@@ -130,7 +132,7 @@ function drawView(view, box, inside) {
   if (!box) return;
   const scale = computeScale(view, width, height), depth = 3 - view.right - view.up;
   const colours = POINT_COLOURS[getTheme()], dot = (nearPoints.length > 3000 ? 1.2 : 1.8) * ratio;
-  const positions = [[], [], []]; // x, y, x, y, … of points outside, inside, and on the ground
+  const positions = [[], [], []]; // x, y, x, y, … of points outside, inside and on the ground
   for (const [k, point] of nearPoints.entries()) {
     const x = (width / 2 + point[view.right] * scale * view.flip) * ratio - dot / 2;
     const y = (height / 2 - point[view.up] * scale) * ratio - dot / 2;
@@ -149,7 +151,7 @@ function drawView(view, box, inside) {
 
 function placeHandles(view, box, width, height, scale) {
   const centre = toLocal(anchor, box[0], box[1], box[2]);
-  const rotation = view.turns ? -(box[6] - anchor[6]) * 180 / Math.PI : 0;
+  const rotation = view.isRotatable ? -(box[6] - anchor[6]) * 180 / Math.PI : 0;
   const x = width / 2 + centre[view.right] * scale * view.flip, y = height / 2 - centre[view.up] * scale;
   const a = box[3 + view.right] * scale / 2, b = box[3 + view.up] * scale / 2;
   const set = (node, values) => {
@@ -165,8 +167,8 @@ function placeHandles(view, box, width, height, scale) {
     set(dot, vertical ? { cx: 0, cy: side * b } : { cx: side * a, cy: 0 });
   }
   if (view.knob) {
-    set(view.ring, { x1: a, x2: a + KNOB_PX, y1: 0, y2: 0 });
-    set(view.knob, { cx: a + KNOB_PX, cy: 0 });
+    set(view.stalk, { x1: a, x2: a + KNOB_DISTANCE_PX, y1: 0, y2: 0 });
+    set(view.knob, { cx: a + KNOB_DISTANCE_PX, cy: 0 });
   }
 }
 
@@ -180,10 +182,10 @@ const redraw = beforeDrawing(() => {
     anchor = box.slice();
     collectPoints();
   }
-  const shown = anchor ? box : null, inside = shown ? findInside(shown) : [];
+  const shownBox = anchor ? box : null, inside = shownBox ? findPointsInside(shownBox) : [];
   for (const view of VIEWS) {
     view.panel.classList.toggle("empty", !box);
-    drawView(view, shown, inside);
+    drawView(view, shownBox, inside);
   }
 });
 

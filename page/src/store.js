@@ -1,28 +1,28 @@
-// The state of the page, and its events. Modules subscribe to changes by name; no other module holds a
-// copy of a track.
+// State of the page, and its events. Modules subscribe to changes by name; no other module stores a copy
+// of a track.
 
 const listeners = new Map();
-const pending = new Set();
+const pendingNames = new Set();
 
 export const store = {
   drive: null, mode: "label",
   seq: 0, tracks: new Map(), checked: new Set(), seeds: [], canUndo: false, canRedo: false,
   progress: null,
-  requestedFrame: 0, // shown once its cloud is loaded
-  frame: 0, // the frame shown; every edit is in this one
-  cloud: null, // of the frame shown
-  selected: null, alsoSelected: new Set(), hover: null, // ids of tracks
-  selectedResult: null, // the selected label or detection: {frame, layer, k, row, error}
-  status: null, // of a running graph
+  requestedFrame: 0, // will be shown when its cloud is loaded
+  frame: 0, // the shown frame, to which all edits apply
+  cloud: null, // cloud of the shown frame
+  selected: null, alsoSelected: new Set(), hover: null, // track ids
+  selectedResult: null, // selected label or detection: {frame, layer, k, row, error}
+  status: null, // status of a running graph
   tool: "select", // "select", "seed", "add"
-  draft: null, // {track, frame, box}, only during a drag or while a key is held
+  draft: null, // unsaved box {track, frame, box} during a drag or while a key is held
   colour: "height", showNames: true, online: true, playing: false, autoAdvance: true,
   stateFilter: "left", classFilter: null, shownTracks: [],
   results: { labels: [], detections: {}, matches: {} }, sources: new Map(), minScore: 0,
   layers: { labels: true, errors: true, tracks: true, trails: true },
 };
 
-/** Call a listener for changes and events of these names, separated by spaces. */
+/** Register a listener for changes and events with these names, separated by spaces. */
 export function on(names, listener) {
   for (const name of names.split(" ")) {
     if (!listeners.has(name)) listeners.set(name, []);
@@ -30,29 +30,21 @@ export function on(names, listener) {
   }
 }
 
-/** Call the listeners of an event at once. */
+/** Call the listeners of an event immediately. */
 export function emit(name, value) {
   for (const listener of listeners.get(name) ?? []) listener(value);
 }
 
-/** Report changes; each listener is called once per turn of the event loop, without arguments. */
+/** Report changes. Each listener is called once per turn of the event loop, without arguments. */
 export function notify(...names) {
-  if (pending.size === 0) queueMicrotask(flush);
-  for (const name of names) pending.add(name);
+  if (pendingNames.size === 0) queueMicrotask(callListeners);
+  for (const name of names) pendingNames.add(name);
 }
 
-function flush() {
-  const names = [...pending];
-  pending.clear();
-  const called = new Set();
-  for (const name of names) {
-    for (const listener of listeners.get(name) ?? []) {
-      if (!called.has(listener)) {
-        called.add(listener);
-        listener();
-      }
-    }
-  }
+function callListeners() {
+  const names = [...pendingNames];
+  pendingNames.clear();
+  for (const listener of new Set(names.flatMap((name) => listeners.get(name) ?? []))) listener();
 }
 
 function toTrack(update) {
@@ -63,16 +55,16 @@ function toTrack(update) {
 }
 
 export function setState(state) {
-  if (state.seq < store.seq) return; // older than an event already applied
+  if (state.seq < store.seq) return; // a later event has already been applied
   store.tracks = new Map(state.tracks.map((track) => [track.id, toTrack(track)]));
   store.seeds = state.seeds ?? [];
   setProgress(state);
-  dropMissingTracks();
+  deselectMissingTracks();
   store.draft = null;
   notify("tracks", "progress", "selection", "draft");
 }
 
-/** Set the drive or graph; the frames of a graph are stored by their numbers. */
+/** Set the drive or graph. The frames of a graph are stored by frame number. */
 export function setDrive(drive) {
   if (drive.live) {
     const frames = [];
@@ -84,7 +76,7 @@ export function setDrive(drive) {
   store.drive = drive;
 }
 
-/** Add a new frame of a running graph, or late boxes of an old one; then emit "live-frame". */
+/** Add a new frame of a running graph, or late boxes of an existing frame; then emit "live-frame". */
 export function addLiveFrame({ first, frame, tracks, ...rest }) {
   const { drive } = store;
   drive.frames[frame] = { ...rest, pose: null };
@@ -95,7 +87,7 @@ export function addLiveFrame({ first, frame, tracks, ...rest }) {
   notify("tracks", "requested-frame");
 }
 
-/** Add the tracks of one frame of a running graph, and drop boxes before `first`. */
+/** Add the tracks of one frame of a running graph, and drop all boxes before frame `first`. */
 function addTracks(tracks, first) {
   for (const update of tracks) {
     const track = store.tracks.get(update.id);
@@ -116,16 +108,16 @@ function addTracks(tracks, first) {
     track.first = Math.min(...track.byFrame.keys());
     if (track.byFrame.size === 0) store.tracks.delete(id);
   }
-  dropMissingTracks();
+  deselectMissingTracks();
 }
 
-/** Apply the event of an action of any page. */
+/** Apply the event of an action that any page has sent. */
 export function applyEvent(event) {
   for (const track of event.tracks ?? []) store.tracks.set(track.id, toTrack(track));
   for (const id of event.removed ?? []) store.tracks.delete(id);
   if (event.seeds) store.seeds = event.seeds;
   setProgress(event);
-  dropMissingTracks();
+  deselectMissingTracks();
   notify("tracks", "progress", "selection");
 }
 
@@ -137,13 +129,14 @@ function setProgress(state) {
   store.progress = state.progress ?? store.progress;
 }
 
-function dropMissingTracks() {
+function deselectMissingTracks() {
   if (store.selected !== null && !store.tracks.has(store.selected)) store.selected = null;
   for (const id of store.alsoSelected) if (!store.tracks.has(id)) store.alsoSelected.delete(id);
 }
 
-export function select(id, { more = false } = {}) {
-  if (more && store.selected !== null && id !== null && id !== store.selected) {
+/** Select a track, or null for none. extend: keep the selected track, and toggle this one in addition. */
+export function select(id, { extend = false } = {}) {
+  if (extend && store.selected !== null && id !== null && id !== store.selected) {
     if (!store.alsoSelected.delete(id)) store.alsoSelected.add(id);
   } else {
     store.selected = id;
@@ -153,7 +146,7 @@ export function select(id, { more = false } = {}) {
   notify("selection");
 }
 
-/** Select a label or a detection of the frame shown. */
+/** Select a label or detection in the shown frame. */
 export function selectResult(result) {
   select(null);
   store.selectedResult = result;
@@ -163,7 +156,7 @@ export function getSelectedTrack() {
   return store.selected === null ? null : store.tracks.get(store.selected) ?? null;
 }
 
-/** Return the box of a track in a frame, or its draft: {box, kind} or null. */
+/** Return the box of a track in a frame, or its draft, as {box, kind}; null if there is none. */
 export function getBox(track, frame = store.frame) {
   const { draft } = store;
   if (draft && track && draft.track === track.id && draft.frame === frame) {
@@ -174,7 +167,7 @@ export function getBox(track, frame = store.frame) {
 
 export function getSelectedBox() {
   const { selectedResult } = store;
-  if (selectedResult?.frame === store.frame) return { box: selectedResult.row.slice(0, 7), kind: "found" };
+  if (selectedResult?.frame === store.frame) return { box: selectedResult.row.slice(0, 7), kind: "result" };
   return getBox(getSelectedTrack());
 }
 

@@ -1,4 +1,4 @@
-// The timeline: boxes of each track by kind, the current frame, checked frames.
+// Timeline with the boxes of each track by kind, the current frame and the checked frames.
 
 import { getClassColour, getTheme } from "./colours.js";
 import { goTo } from "./cloud.js";
@@ -29,7 +29,7 @@ function paint() {
   canvas.height = height * ratio;
   canvas.style.height = `${height}px`;
   document.getElementById("timeline-length").style.height =
-    `${Math.max(0, HEADER_PX + getTracks().length * ROW_PX - height)}px`; // below the canvas, which is sticky
+    `${Math.max(0, HEADER_PX + getTracks().length * ROW_PX - height)}px`; // the rest is covered by the canvas, which is sticky
   const pen = canvas.getContext("2d"), palette = PALETTE[getTheme()], cellWidth = computeCellWidth();
   pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   pen.clearRect(0, 0, width, height);
@@ -101,7 +101,7 @@ function locate(event) {
   const frame = getFirstFrame() + Math.floor((x - NAMES_PX) / computeCellWidth());
   const row = y < HEADER_PX ? -1 : Math.floor((y - HEADER_PX + container.scrollTop) / ROW_PX);
   const last = getFirstFrame() + countFrames() - 1;
-  return { frame: Math.max(getFirstFrame(), Math.min(last, frame)), inNames: x < NAMES_PX,
+  return { frame: Math.max(getFirstFrame(), Math.min(last, frame)), isInNames: x < NAMES_PX,
            track: getTracks()[row] };
 }
 
@@ -109,15 +109,15 @@ export function openTimeline() {
   const slider = document.getElementById("frame");
   slider.oninput = () => stopAndGoTo(Number(slider.value));
   canvas.addEventListener("pointerdown", (event) => {
-    const { frame, track, inNames } = locate(event);
-    if (track) select(track.id, { more: event.ctrlKey || event.metaKey });
-    if (!inNames) {
+    const { frame, track, isInNames } = locate(event);
+    if (track) select(track.id, { extend: event.ctrlKey || event.metaKey });
+    if (!isInNames) {
       stopAndGoTo(frame);
       canvas.setPointerCapture(event.pointerId);
     } else if (track && !track.byFrame.has(store.frame)) goTo(track.first);
   });
   canvas.addEventListener("pointermove", (event) => {
-    if (event.buttons === 1 && !locate(event).inNames) stopAndGoTo(locate(event).frame);
+    if (event.buttons === 1 && !locate(event).isInNames) stopAndGoTo(locate(event).frame);
   });
   container.addEventListener("scroll", redraw);
   new ResizeObserver(redraw).observe(container);
@@ -132,9 +132,9 @@ export function openTimeline() {
     slider.value = store.requestedFrame;
     if (!frame) return;
     slider.setAttribute("aria-valuetext", `frame ${store.requestedFrame}, ${frame.name}`);
-    const behind = (frame.stamp_ns - store.drive.frames[last].stamp_ns) / 1e9;
+    const ageSeconds = (frame.stamp_ns - store.drive.frames[last].stamp_ns) / 1e9;
     document.getElementById("frame-number").textContent = !store.drive.live
-      ? `${store.requestedFrame} / ${last}` : store.playing ? "live" : `${behind.toFixed(1)} s`;
+      ? `${store.requestedFrame} / ${last}` : store.playing ? "live" : `${ageSeconds.toFixed(1)} s`;
     const name = document.getElementById("frame-name");
     const seconds = (frame.stamp_ns - store.drive.frames[getFirstFrame()].stamp_ns) / 1e9;
     name.textContent = frame.name.length < 20 ? frame.name : `${seconds.toFixed(2)} s`;

@@ -1,4 +1,4 @@
-// The top bar: drive, progress, undo, tools, theme, help; and the dialogs for import and export.
+// Top bar with the drive, the progress and buttons, and the dialogs for import and export.
 
 import { sendAction, exportLabels } from "./api.js";
 import { element, icon } from "./dom.js";
@@ -8,30 +8,30 @@ import { COLOUR_SCHEMES, setColourScheme, showHelp } from "./keys.js";
 import { showNote, showLog } from "./messages.js";
 import { stepFrames, togglePlay } from "./playback.js";
 import { setTool } from "./pointer.js";
-import { focusSelection, resetView, topView } from "./scene.js";
+import { focusSelection, resetView, showTopView } from "./scene.js";
 import { notify, on, store } from "./store.js";
 
 const byId = (id) => document.getElementById(id);
 const COMMANDS = {
   undo, redo, propose, play: togglePlay, previous: () => stepFrames(-1), next: () => stepFrames(1),
   focus: focusSelection,
-  "log-open": showLog, "help-open": showHelp, theme: nextTheme, export: () => byId("export-dialog").showModal(),
-  import: () => byId("import-dialog").showModal(), reset: resetView, above: topView,
+  "log-open": showLog, "help-open": showHelp, theme: setNextTheme, export: () => byId("export-dialog").showModal(),
+  import: () => byId("import-dialog").showModal(), reset: resetView, above: showTopView,
   "tool-select": () => setTool("select"), "tool-seed": () => setTool("seed"),
   "tool-add": () => setTool("add"), "reject-rest": rejectRest,
 };
 
 const THEMES = ["auto", "light", "dark"];
 
-function nextTheme() {
+function setNextTheme() {
   const current = document.documentElement.dataset.theme;
   setTheme(THEMES[(THEMES.indexOf(current) + 1) % THEMES.length]);
 }
 
 export function setTheme(name) {
   document.documentElement.dataset.theme = name;
-  byId("theme").title = `Theme: ${name === "auto" ? "as the system" : name}`;
-  try { localStorage.setItem("theme", name); } catch { /* not stored, so it only applies to this page */ }
+  byId("theme").title = `Theme: ${name === "auto" ? "system" : name}`;
+  try { localStorage.setItem("theme", name); } catch { /* without storage, the theme applies to this page only */ }
   notify("theme");
 }
 
@@ -41,9 +41,9 @@ export function openTopbar() {
     const button = byId(id);
     if (button) button.onclick = run;
   }
-  let stored = new URLSearchParams(location.search).get("theme");
-  try { stored ??= localStorage.getItem("theme") ?? "auto"; } catch { /* storage is not allowed */ }
-  setTheme(THEMES.includes(stored) ? stored : "auto");
+  let name = new URLSearchParams(location.search).get("theme");
+  try { name ??= localStorage.getItem("theme") ?? "auto"; } catch { /* the browser does not allow storage */ }
+  setTheme(THEMES.includes(name) ? name : "auto");
   for (const scheme of COLOUR_SCHEMES) byId("colour").append(element("option", { value: scheme }, scheme));
   byId("colour").onchange = () => setColourScheme(byId("colour").value);
   byId("advance").onchange = () => { store.autoAdvance = byId("advance").checked; };
@@ -65,8 +65,8 @@ export function openTopbar() {
   on("connection", () => {
     byId("lost").hidden = store.online;
     byId("lost").textContent = store.refused
-      ? "The server was restarted. Open the address that it printed, which has a new token."
-      : "Connection lost. Saved labels are safe; reconnecting…";
+      ? "The server was restarted with a new token. Open the address that it printed."
+      : "Connection lost, reconnecting… Saved labels are safe.";
   });
   on("colour", () => { byId("colour").value = store.colour; });
   on("tool drive", showTool);
@@ -84,7 +84,7 @@ function showDrive() {
   document.documentElement.dataset.mode = store.mode;
   byId("drive").textContent = name;
   byId("drive").title = path;
-  byId("layout").textContent = store.drive.live ? "the running graph" : `${layout} · ${frames.length} frame${frames.length === 1 ? "" : "s"}`;
+  byId("layout").textContent = store.drive.live ? "running graph" : `${layout} · ${frames.length} frame${frames.length === 1 ? "" : "s"}`;
   const choices = () => (formats ?? []).map((format) =>
     element("option", { value: format }, format.replaceAll("_", " ")));
   byId("export-format").replaceChildren(...choices());
@@ -106,7 +106,7 @@ function showProgress() {
   if (byId("busy").hidden !== !busy) notify("busy");
   byId("busy").hidden = !busy;
   if (busy) {
-    byId("busy").textContent = `${busy.what} ${busy.done} of ${busy.of}`;
+    byId("busy").textContent = `${busy.what}: frame ${busy.done} of ${busy.of}`;
     byId("busy").style.setProperty("--done", busy.of ? busy.done / busy.of : 0);
   }
   byId("propose").disabled = Boolean(busy);
@@ -119,8 +119,8 @@ function showTool() {
   byId("tool-hint").hidden = store.tool === "select" || !store.drive;
   if (byId("tool-hint").hidden) return;
   byId("tool-hint").firstElementChild.textContent = store.tool === "add"
-    ? "Click where to place the new box. Esc ends."
-    : "Click a point of an object: similar objects are proposed in the whole drive. Esc ends.";
+    ? "Click where to place the new box. Press Esc to leave the tool."
+    : "Click an object to propose similar objects in the whole drive. Press Esc to leave the tool.";
   byId("tool-classes").replaceChildren(...store.drive.classes.slice(0, 9).map(({ name }, k) =>
     element("button", { class: "chip", "aria-pressed": String(name === getNewClass()),
       onclick: () => setClass(name) },
@@ -137,8 +137,8 @@ async function sendExport(event) {
     const result = await exportLabels({ format: byId("export-format").value,
       out: byId("export-out").value, force: byId("export-force").checked });
     byId("export-dialog").close();
-    const exceptions = result.left_out.length ? `, without ${result.left_out.join(", ")}` : "";
-    showNote(`Exported ${result.boxes} boxes of ${result.frames} frames to ${result.path}${exceptions}`);
+    const leftOut = result.left_out.length ? `. Left out: ${result.left_out.join(", ")}` : "";
+    showNote(`Exported ${result.boxes} boxes in ${result.frames} frames to ${result.path}${leftOut}`);
   } catch (error) {
     errorLine.textContent = error.message;
   } finally {
@@ -148,7 +148,7 @@ async function sendExport(event) {
 
 async function sendImport(event) {
   event.preventDefault();
-  const errorLine = byId("import-error"); // the dialog would hide a message
+  const errorLine = byId("import-error"); // shown in the dialog, which would hide a toast
   errorLine.textContent = "";
   if (await sendAction({ do: "import", path: byId("import-path").value, format: byId("import-format").value },
     (text) => { errorLine.textContent = text; })) byId("import-dialog").close();

@@ -1,4 +1,4 @@
-// The list of tracks: undecided, accepted and rejected ones, the most uncertain first.
+// List of tracks, filtered by state and class, most uncertain first.
 
 import { getClassColour, getTheme } from "./colours.js";
 import { goTo } from "./cloud.js";
@@ -6,9 +6,9 @@ import { element, icon } from "./dom.js";
 import { decideTrack } from "./edits.js";
 import { getBox, notify, on, select, store } from "./store.js";
 
-const FILTERS = { left: "Left", accepted: "Accepted", rejected: "Rejected", all: "All" };
+const FILTER_TITLES = { left: "Undecided", accepted: "Accepted", rejected: "Rejected", all: "All" };
 const STATE_BY_FILTER = { left: "proposed", accepted: "accepted", rejected: "rejected" };
-const ROW_PX = 34; // as in panels.css
+const ROW_PX = 34; // same height as in panels.css
 const list = document.getElementById("tracks");
 const filterTabs = document.getElementById("filters");
 let isRowPressed = false, isRenderPending = false;
@@ -19,7 +19,7 @@ function listTracks() {
   return [...store.tracks.values()]
     .filter((track) => track.id === store.selected || ((!listedState || track.state === listedState)
       && (!store.classFilter || track.class === store.classFilter)))
-    .sort((a, b) => store.drive?.live ? b.last - a.last || b.id - a.id // the newest first
+    .sort((a, b) => store.drive?.live ? b.last - a.last || b.id - a.id // newest first
       : (b.uncertainty ?? 0) - (a.uncertainty ?? 0) || a.id - b.id);
 }
 
@@ -46,24 +46,24 @@ function makeRow(track) {
   element("span", { class: "what" }, `${track.byFrame.size} frame${track.byFrame.size === 1 ? "" : "s"}`,
           track.source === "imported" ? " · imported" : ` · ${percent} % ${track.source}`),
   ...(store.mode === "label" ? [
-    makeVerdictButton(track, "accept", "check", "accepted"), makeVerdictButton(track, "reject", "reject", "rejected"),
+    makeDecisionButton(track, "accept", "check", "accepted"), makeDecisionButton(track, "reject", "reject", "rejected"),
   ] : []));
 }
 
-function makeVerdictButton(track, verb, iconName, state) {
+function makeDecisionButton(track, decision, iconName, state) {
   return element("button", {
-    class: `bare ${verb}`, tabindex: -1, title: `${verb[0].toUpperCase()}${verb.slice(1)}`,
-    "aria-label": `${verb} track ${track.id}`, "aria-pressed": String(track.state === state),
+    class: `bare ${decision}`, tabindex: -1, title: `${decision[0].toUpperCase()}${decision.slice(1)}`,
+    "aria-label": `${decision} track ${track.id}`, "aria-pressed": String(track.state === state),
     onclick: (event) => {
       event.stopPropagation();
       select(track.id);
-      decideTrack(track.state === state ? "reopen" : verb);
+      decideTrack(track.state === state ? "reopen" : decision);
     },
   }, icon(iconName));
 }
 
 async function selectTrack(track, event) {
-  select(track.id, { more: event.ctrlKey || event.metaKey });
+  select(track.id, { extend: event.ctrlKey || event.metaKey });
   if (!getBox(track) && !event.ctrlKey && !event.metaKey) await goTo(findNearestFrame(track));
   notify("focus");
 }
@@ -83,14 +83,14 @@ function rebuild() {
   }
   rejectRestButton.disabled = counts.left === 0;
   rejectRestButton.querySelector("span").textContent = counts.left || "";
-  showClasses();
+  showClassButtons();
   renderRows();
   const index = store.shownTracks.findIndex((track) => track.id === store.selected);
   list.setAttribute("aria-activedescendant", index < 0 ? "" : `track-${store.selected}`);
 }
 
-/** Show a button for each class of tracks, if there are several, that limits the list to it. */
-function showClasses() {
+/** If there are tracks of several classes, show a button for each class that filters the list. */
+function showClassButtons() {
   const names = [...new Set([...store.tracks.values()].map((track) => track.class))].sort();
   if (store.classFilter && !names.includes(store.classFilter)) store.classFilter = null;
   classButtons.hidden = names.length < 2;
@@ -98,31 +98,31 @@ function showClasses() {
   if (classButtons.hidden || classButtons.dataset.key === key) return;
   classButtons.dataset.key = key;
   classButtons.replaceChildren(...names.map((name) => element("button", {
-    class: "chip", "aria-pressed": String(name === store.classFilter), title: `Only ${name}, or all`,
+    class: "chip", "aria-pressed": String(name === store.classFilter), title: `Show only ${name}, or all classes`,
     onclick: () => { store.classFilter = store.classFilter === name ? null : name; rebuild(); },
   }, element("i", { class: "dot", style: `background:${getClassColour(name)}` }), name)));
 }
 
-/** Render only the visible rows; not while a row is pressed, so that the click hits the same row. */
+/** Render the visible rows. While a row is pressed, rendering waits, so that the click hits the same row. */
 function renderRows() {
   if (isRowPressed) { isRenderPending = true; return; }
   const tracks = store.shownTracks, first = Math.max(0, Math.floor(list.scrollTop / ROW_PX) - 2);
   const visible = tracks.slice(first, first + Math.ceil(list.clientHeight / ROW_PX) + 4);
-  const rest = tracks.length - first - visible.length;
-  const gap = (count) => element("div", { style: `height:${count * ROW_PX}px`, "aria-hidden": "true" });
-  list.replaceChildren(gap(first), ...visible.map(makeRow), gap(rest));
-  if (tracks.length === 0) list.append(element("p", { class: "hint" }, emptyHint()));
+  const countBelow = tracks.length - first - visible.length;
+  const makeGap = (count) => element("div", { style: `height:${count * ROW_PX}px`, "aria-hidden": "true" });
+  list.replaceChildren(makeGap(first), ...visible.map(makeRow), makeGap(countBelow));
+  if (tracks.length === 0) list.append(element("p", { class: "hint" }, getEmptyHint()));
 }
 
-function emptyHint() {
+function getEmptyHint() {
   if (store.mode === "view") return "No tracks in this recording.";
   if (store.tracks.size === 0 && store.progress?.busy) {
-    return "The detectors are searching the whole drive; proposals appear here when they are done. "
-      + "Meanwhile, press S and click an object, or B and click, to start a track by hand.";
+    return "The detectors are processing the whole drive. Proposals appear here when they have finished. "
+      + "Meanwhile, you can press S and click an object, or press B and click to add a box.";
   }
   if (store.tracks.size === 0) {
-    return "No tracks yet. Press P to propose tracks with the detectors, S and click an object, or "
-      + "B and click to add a box.";
+    return "No tracks yet. Press P to propose tracks with the detectors, press S and click an object, or "
+      + "press B and click to add a box.";
   }
   return store.stateFilter === "left" ? "All tracks are decided." : `No ${store.stateFilter} tracks.`;
 }
@@ -142,7 +142,7 @@ function moveSelection(step) {
 }
 
 export function openTrackList() {
-  for (const [name, title] of Object.entries(FILTERS)) {
+  for (const [name, title] of Object.entries(FILTER_TITLES)) {
     filterTabs.append(element("button", {
       role: "tab", "data-filter": name, "aria-controls": "tracks",
       onclick: () => { store.stateFilter = name; rebuild(); },
@@ -152,13 +152,13 @@ export function openTrackList() {
   list.addEventListener("pointerdown", (event) => {
     isRowPressed = event.target.closest("[data-track]") !== null;
   });
-  for (const end of ["pointerup", "pointercancel"]) {
-    addEventListener(end, () => setTimeout(() => { // after the click
+  for (const name of ["pointerup", "pointercancel"]) {
+    addEventListener(name, () => setTimeout(() => { // after the click event
       isRowPressed = false;
       if (isRenderPending) { isRenderPending = false; renderRows(); }
     }));
   }
-  list.addEventListener("mousedown", (event) => { // keep focus, so that arrow keys move the box
+  list.addEventListener("mousedown", (event) => { // keep the focus where it is, so that arrow keys move the box
     if (event.target !== list) event.preventDefault();
   });
   list.addEventListener("keydown", (event) => {

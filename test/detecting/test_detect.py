@@ -114,7 +114,7 @@ def test_all_formats_of_a_run_have_the_same_boxes(drives, tmp_path, monkeypatch)
     bag, shown = seen_by_view(out / "bag")
     for i, frame in enumerate(bag.frames):
         np.testing.assert_array_equal(frame.load().xyz, frames[i].load().xyz)
-        boxes = shown.layers(i, frame, 0.0)["detections"]["made_detector"]
+        boxes = shown.make_layers(i, frame, 0.0)["detections"]["made_detector"]
         np.testing.assert_allclose([row[:7] for row in boxes], np.array(found[frames[i].name])[:, 2:], atol=1e-3)
         assert [row[8] for row in boxes] == pytest.approx([row[1] for row in found[frames[i].name]])
         assert [row[9] for row in boxes] == [{"a": 0.5}, {}]

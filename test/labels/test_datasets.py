@@ -255,7 +255,7 @@ def test_boxes_are_transformed_to_the_frame_of_the_clouds(parts, tmp_path):
     for i, (frame, each) in enumerate(zip(frames, labels.frames)):
         near = transform_boxes(boxes, invert_pose(base_at(frame.stamp_ns) @ ON_BASE))
         np.testing.assert_allclose(each.boxes, near, atol=1e-3)
-        np.testing.assert_allclose(shown.sources["n"].find(i, frame).boxes, near, atol=1e-3)
+        np.testing.assert_allclose(shown.sources["n"].detect(i, frame).boxes, near, atol=1e-3)
         np.testing.assert_allclose(shown.tracks[0]["boxes"][i][1:8], near[0], atol=1e-3)
 
 

@@ -60,7 +60,7 @@ def view(shared_processes, shared_peer):
 def received(shared_processes, shared_peer, view, drive_bag):
     """Return the messages of the detector while a bag is played in a loop."""
     shared_peer.wait(
-        lambda: any("nobody publishes clouds" in line for line in view.json("api/drive")["status"]["lines"]),
+        lambda: any("no point clouds are published" in line for line in view.json("api/drive")["status"]["lines"]),
         "a clear line",
     )
     assert view.json("api/drive")["frames"] == []

@@ -1,4 +1,4 @@
-"""Actions of a labelling session: replay, undo, interpolation between frames."""
+"""Tests of the actions of a labelling session: replay, undo, interpolation between frames."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from lidar_studio.interpolation import Motion
 from lidar_studio.state import KEY, PROPOSED, Box, State, Track, find_next_uncertain, track_from_json, track_to_json
 
 FRAMES = 8
-STAMPS = np.array([0, 100, 200, 350, 400, 500, 650, 700]) * 10**6  # uneven intervals
+STAMPS = np.array([0, 100, 200, 350, 400, 500, 650, 700]) * 10**6  # ns, at irregular intervals
 SIZE = [0.8, 0.6, 1.7]
 
 
-def poses(turn=0.05, speed=8.0):
-    """Poses of a sensor on a curve."""
-    found = np.tile(np.eye(4), (FRAMES, 1, 1))
+def make_poses(turn=0.05, speed=8.0):
+    """Return the poses of a sensor that drives along a curve."""
+    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
     for i, t in enumerate(STAMPS / 1e9):
         cos, sin = math.cos(turn * i), math.sin(turn * i)
-        found[i, :2, :2] = [[cos, -sin], [sin, cos]]
-        found[i, :2, 3] = [speed * t, 0.3 * t]
-    return found
+        poses[i, :2, :2] = [[cos, -sin], [sin, cos]]
+        poses[i, :2, 3] = [speed * t, 0.3 * t]
+    return poses
 
 
-STANDING, DRIVING = Motion.of(STAMPS), Motion.of(STAMPS, poses())
+STANDING, DRIVING = Motion.from_stamps(STAMPS), Motion.from_stamps(STAMPS, make_poses())
 frames = st.integers(0, FRAMES - 1)
 tracks = st.integers(1, 6)
 metres = st.floats(-50, 50)
@@ -66,35 +66,35 @@ ACTIONS = st.one_of(
 )
 
 
-def done(actions, motion, state=State()):
-    """Return the state after all valid actions, and the list of these actions."""
-    lines = []
+def apply_valid(actions, motion, state=State()):
+    """Apply all valid actions; return the resulting state and these actions."""
+    valid_actions = []
     for action in actions:
         try:
             state, _ = apply(state, action, motion)
-            lines.append(action)
+            valid_actions.append(action)
         except InputError:
             pass
-    return state, lines
+    return state, valid_actions
 
 
-def labels(state):
+def get_labels(state):
     """Return the part of the state that the page shows."""
-    return dict(state.tracks), state.seeds, state.checked
+    return dict(state.tracks), state.seeds, state.checked_frames
 
 
-def close(a, b, tolerance=1e-9):
+def boxes_are_close(a, b, tolerance=1e-9):
     """Return True if two boxes are equal up to a tolerance."""
-    apart = np.array(a) - np.array(b)
-    apart[6] = wrap_angle(apart[6])
-    return bool((np.abs(apart) <= tolerance).all())
+    difference = np.array(a) - np.array(b)
+    difference[6] = wrap_angle(difference[6])
+    return bool((np.abs(difference) <= tolerance).all())
 
 
 @given(st.lists(ACTIONS, max_size=30), st.sampled_from([STANDING, DRIVING]))
-def test_replaying_the_lines_gives_the_same_state(actions, motion):
-    state, lines = done(actions, motion)
-    again, _ = done(json.loads(json.dumps(lines)), motion)
-    assert again == state
+def test_replayed_actions_give_the_same_state(actions, motion):
+    state, valid_actions = apply_valid(actions, motion)
+    replayed_state, _ = apply_valid(json.loads(json.dumps(valid_actions)), motion)
+    assert replayed_state == state
     for track in state.tracks.values():
         assert track_from_json(json.loads(json.dumps(track_to_json(track)))) == track
         assert all(np.isfinite(b.values).all() and min(b.values[3:6]) > 0 for b in track.boxes.values())
@@ -103,31 +103,31 @@ def test_replaying_the_lines_gives_the_same_state(actions, motion):
 
 @given(st.lists(ACTIONS, max_size=25), st.sampled_from([STANDING, DRIVING]))
 def test_undo_and_redo_are_inverses_at_any_depth(actions, motion):
-    end, _ = done(actions, motion)
-    seen, state = [labels(end)], end
+    last_state, _ = apply_valid(actions, motion)
+    history, state = [get_labels(last_state)], last_state
     while state.undo_stack is not None:
         state, _ = apply(state, {"do": "undo"}, motion)
-        seen.append(labels(state))
-    assert labels(state) == labels(State())
-    for expected in reversed(seen[:-1]):
+        history.append(get_labels(state))
+    assert get_labels(state) == get_labels(State())
+    for expected in reversed(history[:-1]):
         state, _ = apply(state, {"do": "redo"}, motion)
-        assert labels(state) == expected
-    assert state.next_id == end.next_id  # ids are never reused
+        assert get_labels(state) == expected
+    assert state.next_id == last_state.next_id  # ids are never reused
 
 
 @given(ACTIONS, st.lists(ACTIONS, max_size=8))
-def test_invalid_action_changes_nothing(action, before):
-    state, _ = done(before, DRIVING)
-    kept = labels(state), state.seq
+def test_invalid_action_changes_nothing(action, earlier_actions):
+    state, _ = apply_valid(earlier_actions, DRIVING)
+    expected = get_labels(state), state.seq
     try:
         apply(state, action, DRIVING)
     except InputError as error:
         assert "\n" not in str(error)
-    assert (labels(state), state.seq) == kept
+    assert (get_labels(state), state.seq) == expected
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "action",
     [
         {"do": "fly"},
         {},
@@ -148,22 +148,22 @@ def test_invalid_action_changes_nothing(action, before):
     ],
     ids=str,
 )
-def test_invalid_action_is_refused_in_one_line(wrong):
+def test_invalid_action_raises_one_line_error(action):
     with pytest.raises(InputError) as error:
-        apply(State(), wrong, STANDING)
+        apply(State(), action, STANDING)
     assert "\n" not in str(error.value)
 
 
-def walking(start, velocity, motion, kind=KEY):
-    """Boxes by frame of an object with constant velocity in the fixed frame."""
-    found = {}
+def make_moving_boxes(start, velocity, motion, kind=KEY):
+    """Return the boxes by frame of an object with constant velocity in the fixed frame."""
+    moving_boxes = {}
     for f, t in enumerate(motion.times):
         fixed = np.array(
             [start[0] + velocity[0] * t, start[1] + velocity[1] * t, -0.9, *SIZE, math.atan2(velocity[1], velocity[0])]
         )
         box = fixed if motion.poses is None else transform_boxes(fixed, invert_pose(motion.poses[f]))[0]
-        found[f] = Box.of(box, kind)
-    return found
+        moving_boxes[f] = Box.from_array(box, kind)
+    return moving_boxes
 
 
 @given(
@@ -173,65 +173,61 @@ def walking(start, velocity, motion, kind=KEY):
     st.sets(frames, min_size=2),
     st.randoms(),
 )
-def test_constant_motion_is_exact_between_key_boxes_in_any_order(start, velocity, motion, keys, random):
-    true = walking(start, velocity, motion)
-    order = sorted(keys)
+def test_constant_motion_is_interpolated_exactly(start, velocity, motion, key_frames, random):
+    expected = make_moving_boxes(start, velocity, motion)
+    order = sorted(key_frames)
     random.shuffle(order)
-    state, _ = done(
+    state, _ = apply_valid(
         [
-            {"do": "add", "frame": order[0], "class": "Pedestrian", "box": list(true[order[0]].values)},
-            *({"do": "box", "track": 1, "frame": f, "box": list(true[f].values)} for f in order[1:]),
+            {"do": "add", "frame": order[0], "class": "Pedestrian", "box": list(expected[order[0]].values)},
+            *({"do": "box", "track": 1, "frame": f, "box": list(expected[f].values)} for f in order[1:]),
         ],
         motion,
     )
-    found = state.tracks[1].boxes
-    assert found.keys() == set(range(min(keys), max(keys) + 1))
-    for f, box in found.items():
-        assert close(box.values, true[f].values, 1e-7)
-        assert (box.kind == KEY) == (f in keys)
-        if f in keys:
-            assert box.values == true[f].values  # exactly
+    track_boxes = state.tracks[1].boxes
+    assert track_boxes.keys() == set(range(min(key_frames), max(key_frames) + 1))
+    for f, box in track_boxes.items():
+        assert boxes_are_close(box.values, expected[f].values, 1e-7)
+        assert (box.kind == KEY) == (f in key_frames)
+        if f in key_frames:
+            assert box.values == expected[f].values  # exactly equal
 
 
 @given(
     st.tuples(st.floats(-1, 1), st.floats(-1, 1)), st.floats(-1.5, 1.5), frames, st.sampled_from([STANDING, DRIVING])
 )
-def test_correction_moves_a_whole_track_without_key_boxes(shift, turn, frame, motion):
-    true = walking((5.0, 3.0), (1.0, 0.5), motion, PROPOSED)
-    off = {}
-    for f, box in true.items():
-        wrong = motion.to_fixed(box.values, f) + [*shift, 0.1, 0.2, -0.1, 0.3, turn]
-        off[f] = Box.of(motion.to_sensor(wrong, f), PROPOSED)
-    state = State({1: Track(1, "Pedestrian", boxes=off)}, next_id=2)
-    after, _ = apply(state, {"do": "box", "track": 1, "frame": frame, "box": list(true[frame].values)}, motion)
-    for f, box in after.tracks[1].boxes.items():
-        assert close(box.values, true[f].values, 1e-7)
+def test_correction_moves_all_boxes_without_key_boxes(shift, turn, frame, motion):
+    expected = make_moving_boxes((5.0, 3.0), (1.0, 0.5), motion, PROPOSED)
+    shifted_boxes = {}
+    for f, box in expected.items():
+        shifted_box = motion.to_fixed(box.values, f) + [*shift, 0.1, 0.2, -0.1, 0.3, turn]
+        shifted_boxes[f] = Box.from_array(motion.to_sensor(shifted_box, f), PROPOSED)
+    state = State({1: Track(1, "Pedestrian", boxes=shifted_boxes)}, next_id=2)
+    state, _ = apply(state, {"do": "box", "track": 1, "frame": frame, "box": list(expected[frame].values)}, motion)
+    for f, box in state.tracks[1].boxes.items():
+        assert boxes_are_close(box.values, expected[f].values, 1e-7)
 
 
 def test_correction_ends_at_the_next_key_box():
-    true = walking((5.0, 3.0), (1.0, 0.0), STANDING, PROPOSED)
-    true[3] = replace_kind(true[3])
-    state = State({1: Track(1, "Pedestrian", boxes=true)}, next_id=2)
-    moved = list(true[6].values)
-    moved[1] += 1.0
-    after = apply(state, {"do": "box", "track": 1, "frame": 6, "box": moved}, STANDING)[0].tracks[1]
-    assert all(after.boxes[f] == true[f] for f in range(4))
-    shares = [after.boxes[f].values[1] - true[f].values[1] for f in range(3, 8)]
-    assert np.allclose(shares, [0, 50 / 300, 150 / 300, 1, 1])
+    boxes = make_moving_boxes((5.0, 3.0), (1.0, 0.0), STANDING, PROPOSED)
+    boxes[3] = Box(boxes[3].values, KEY)
+    state = State({1: Track(1, "Pedestrian", boxes=boxes)}, next_id=2)
+    new_box = list(boxes[6].values)
+    new_box[1] += 1.0
+    track = apply(state, {"do": "box", "track": 1, "frame": 6, "box": new_box}, STANDING)[0].tracks[1]
+    assert all(track.boxes[f] == boxes[f] for f in range(4))
+    shifts = [track.boxes[f].values[1] - boxes[f].values[1] for f in range(3, 8)]
+    assert np.allclose(shifts, [0, 50 / 300, 150 / 300, 1, 1])
 
 
-def replace_kind(box):
-    return Box(box.values, KEY)
-
-
-def test_frame_emptied_by_the_user_stays_empty():
-    true = walking((5.0, 3.0), (1.0, 0.0), STANDING, PROPOSED)
-    state = State({1: Track(1, "Pedestrian", boxes=true)}, next_id=2)
-    state, _ = done(
+def test_removed_box_is_not_interpolated_again():
+    boxes = make_moving_boxes((5.0, 3.0), (1.0, 0.0), STANDING, PROPOSED)
+    state = State({1: Track(1, "Pedestrian", boxes=boxes)}, next_id=2)
+    state, _ = apply_valid(
         [
             {"do": "remove_box", "track": 1, "frame": 3},
-            {"do": "box", "track": 1, "frame": 0, "box": list(true[0].values)},
-            {"do": "box", "track": 1, "frame": 7, "box": list(true[7].values)},
+            {"do": "box", "track": 1, "frame": 0, "box": list(boxes[0].values)},
+            {"do": "box", "track": 1, "frame": 7, "box": list(boxes[7].values)},
         ],
         STANDING,
         state,
@@ -240,27 +236,29 @@ def test_frame_emptied_by_the_user_stays_empty():
 
 
 @given(st.sets(frames, min_size=2), st.integers(1, FRAMES - 1))
-def test_split_and_merge_are_inverses(there, cut):
-    true = walking((5.0, 3.0), (1.0, 0.5), DRIVING, PROPOSED)
-    track = Track(1, "Pedestrian", boxes={f: true[f] for f in there}, removed_frames=frozenset({0}) - there)
-    state = State({1: track}, seeds=((min(there), 1), (max(there), 1)), next_id=2)
+def test_split_and_merge_are_inverses(track_frames, split_frame):
+    boxes = make_moving_boxes((5.0, 3.0), (1.0, 0.5), DRIVING, PROPOSED)
+    removed_frames = frozenset({0}) - track_frames
+    track = Track(1, "Pedestrian", boxes={f: boxes[f] for f in track_frames}, removed_frames=removed_frames)
+    state = State({1: track}, seeds=((min(track_frames), 1), (max(track_frames), 1)), next_id=2)
+    split_action = {"do": "split", "track": 1, "frame": split_frame}
     try:
-        parts, _ = apply(state, {"do": "split", "track": 1, "frame": cut}, DRIVING)
+        split_state, _ = apply(state, split_action, DRIVING)
     except InputError:
-        assert min(there) >= cut or max(there) < cut
+        assert min(track_frames) >= split_frame or max(track_frames) < split_frame
         return
-    assert max(parts.tracks[1].boxes) < cut <= min(parts.tracks[2].boxes)
-    whole, _ = apply(parts, {"do": "merge", "tracks": [1, 2]}, DRIVING)
-    assert {1: replace(whole.tracks[1], edited=False)} == state.tracks
-    assert set(whole.seeds) == set(state.seeds)
-    again, _ = apply(whole, {"do": "split", "track": 1, "frame": cut}, DRIVING)
-    assert again.tracks[1] == parts.tracks[1]
-    assert again.tracks[3] == replace(parts.tracks[2], id=3)
+    assert max(split_state.tracks[1].boxes) < split_frame <= min(split_state.tracks[2].boxes)
+    merged_state, _ = apply(split_state, {"do": "merge", "tracks": [1, 2]}, DRIVING)
+    assert {1: replace(merged_state.tracks[1], is_edited=False)} == state.tracks
+    assert set(merged_state.seeds) == set(state.seeds)
+    resplit_state, _ = apply(merged_state, split_action, DRIVING)
+    assert resplit_state.tracks[1] == split_state.tracks[1]
+    assert resplit_state.tracks[3] == replace(split_state.tracks[2], id=3)
 
 
 def test_trim_keeps_the_same_boxes_as_split():
-    true = walking((5.0, 3.0), (1.0, 0.5), DRIVING, PROPOSED)
-    state = State({1: Track(1, "Pedestrian", boxes=true)}, seeds=((2, 1), (6, 1)), next_id=2)
+    boxes = make_moving_boxes((5.0, 3.0), (1.0, 0.5), DRIVING, PROPOSED)
+    state = State({1: Track(1, "Pedestrian", boxes=boxes)}, seeds=((2, 1), (6, 1)), next_id=2)
     early, _ = apply(state, {"do": "trim", "track": 1, "frame": 3, "side": "after"}, DRIVING)
     late, _ = apply(state, {"do": "trim", "track": 1, "frame": 4, "side": "before"}, DRIVING)
     parts, _ = apply(state, {"do": "split", "track": 1, "frame": 4}, DRIVING)
@@ -272,9 +270,9 @@ def test_trim_keeps_the_same_boxes_as_split():
             apply(state, {"do": "trim", "track": 1, "frame": frame, "side": side}, DRIVING)
 
 
-def test_copied_box_stands_still_in_the_fixed_frame():
+def test_copied_box_keeps_its_fixed_position():
     box = [12.0, -3.0, -0.9, *SIZE, 0.4]
-    state, _ = done(
+    state, _ = apply_valid(
         [
             {"do": "add", "frame": 1, "box": box, "class": "Car"},
             {"do": "copy", "track": 1, "from": 1, "to": 6},
@@ -282,9 +280,9 @@ def test_copied_box_stands_still_in_the_fixed_frame():
         ],
         DRIVING,
     )
-    found = state.tracks[1].boxes
-    assert close(found[1].values, box)
-    assert all(close(DRIVING.to_fixed(b.values, f), DRIVING.to_fixed(box, 1)) for f, b in found.items())
+    copies = state.tracks[1].boxes
+    assert boxes_are_close(copies[1].values, box)
+    assert all(boxes_are_close(DRIVING.to_fixed(b.values, f), DRIVING.to_fixed(box, 1)) for f, b in copies.items())
 
 
 def test_next_uncertain_wraps_around():
@@ -292,51 +290,53 @@ def test_next_uncertain_wraps_around():
         return Track(number, "Car", score=score, boxes={0: Box((9.0,) * 7, PROPOSED)}, **more)
 
     state = State({t.id: t for t in (track(1, 0.9), track(2, 0.45), track(3, 0.55), track(4, 0.5, state="accepted"))})
-    seen = [find_next_uncertain(state, after).id for after in (None, 2, 3, 1, 4)]
-    assert seen == [2, 3, 1, 2, 2]
+    next_ids = [find_next_uncertain(state, after).id for after in (None, 2, 3, 1, 4)]
+    assert next_ids == [2, 3, 1, 2, 2]
     assert find_next_uncertain(State()) is None
 
 
-def test_rest_of_a_class_is_rejected_and_restored_as_one_action():
+def test_rejecting_the_rest_is_undone_as_one_action():
     def track(number, name, **more):
         return Track(number, name, boxes={0: Box((9.0,) * 7, PROPOSED)}, **more)
 
     state = State(
         {t.id: t for t in (track(1, "Car"), track(2, "Van"), track(3, "Car"), track(4, "Car", state="accepted"))}
     )
-    cars, _ = apply(state, {"do": "reject_rest", "class": "Car"}, STANDING)
-    assert [t.state for t in cars.tracks.values()] == ["rejected", "proposed", "rejected", "accepted"]
-    every, _ = apply(cars, {"do": "reject_rest"}, STANDING)
-    assert every.tracks[2].state == "rejected" and every.tracks[4].state == "accepted"
-    with pytest.raises(InputError, match="left to reject"):
-        apply(every, {"do": "reject_rest"}, STANDING)
-    back, _ = apply(cars, {"do": "undo"}, STANDING)
-    assert back.tracks == state.tracks
+    without_cars, _ = apply(state, {"do": "reject_rest", "class": "Car"}, STANDING)
+    assert [t.state for t in without_cars.tracks.values()] == ["rejected", "proposed", "rejected", "accepted"]
+    all_decided, _ = apply(without_cars, {"do": "reject_rest"}, STANDING)
+    assert all_decided.tracks[2].state == "rejected" and all_decided.tracks[4].state == "accepted"
+    with pytest.raises(InputError, match="no undecided tracks"):
+        apply(all_decided, {"do": "reject_rest"}, STANDING)
+    undone, _ = apply(without_cars, {"do": "undo"}, STANDING)
+    assert undone.tracks == state.tracks
 
 
 @given(st.lists(ACTIONS, max_size=6), ACTIONS)
-def test_joined_action_is_undone_with_the_previous_one(before, action):
-    state, _ = done([*before, {"do": "add", "frame": 1, "box": [5, 0, 0, *SIZE, 0], "class": "Van"}], DRIVING)
-    below = state.undo_stack[1]
-    rest = {
+def test_joined_action_is_undone_with_the_previous_one(earlier_actions, action):
+    state, _ = apply_valid(
+        [*earlier_actions, {"do": "add", "frame": 1, "box": [5, 0, 0, *SIZE, 0], "class": "Van"}], DRIVING
+    )
+    previous_stack = state.undo_stack[1]
+    joined_action = {
         "do": "propose",
         "joins": True,
         "removed": [state.next_id - 1],
         "tracks": [Track(state.next_id, "Car", boxes={2: Box((9.0,) * 7, PROPOSED)})],
     }
-    line = json.dumps(convert_tracks(rest, track_to_json))
-    assert convert_tracks(json.loads(line), track_from_json) == rest
-    both, _ = apply(state, rest, DRIVING)
-    back, _ = apply(both, {"do": "undo"}, DRIVING)
+    line = json.dumps(convert_tracks(joined_action, track_to_json))
+    assert convert_tracks(json.loads(line), track_from_json) == joined_action
+    joined_state, _ = apply(state, joined_action, DRIVING)
+    both_undone, _ = apply(joined_state, {"do": "undo"}, DRIVING)
     undone, _ = apply(state, {"do": "undo"}, DRIVING)
-    assert labels(back) == labels(undone) and back.undo_stack == below
-    again, _ = apply(back, {"do": "redo"}, DRIVING)
-    assert labels(again) == labels(both)
+    assert get_labels(both_undone) == get_labels(undone) and both_undone.undo_stack == previous_stack
+    redone, _ = apply(both_undone, {"do": "redo"}, DRIVING)
+    assert get_labels(redone) == get_labels(joined_state)
 
 
 def test_every_action_is_tested():
-    tried = {"seed", "propose", "import"}  # tested in test_label_server.py
-    named = {
+    tested_elsewhere = {"seed", "propose", "import"}  # in test_label_server.py
+    tested_here = {
         "add",
         "box",
         "snap",
@@ -354,4 +354,4 @@ def test_every_action_is_tested():
         "class",
         "check",
     }
-    assert tried | named == HANDLERS.keys()
+    assert tested_elsewhere | tested_here == HANDLERS.keys()

@@ -1,4 +1,4 @@
-"""The journal file after kills, on full disks, and of other drives."""
+"""Tests of the journal file: killed processes, full disks, other drives."""
 
 from __future__ import annotations
 
@@ -13,40 +13,40 @@ import pytest
 from lidar_perception.types import InputError
 from lidar_studio.journal import JOURNAL_NAME, Journal, make_journal_header, open_journal
 
-HEAD = make_journal_header("drive", ["a", "b c"], [1, 2])
+HEADER = make_journal_header("drive", ["a", "b c"], [1, 2])
 
 
-def lines(count):
+def make_lines(count):
     return [{"seq": i, "do": "check", "frame": i, "checked": True} for i in range(1, count + 1)]
 
 
-def filled(folder, count):
+def write_journal(folder, count):
     """Write a journal with `count` actions and return its bytes."""
-    with open_journal(folder, HEAD) as journal:
-        for line in lines(count):
+    with open_journal(folder, HEADER) as journal:
+        for line in make_lines(count):
             journal.append(line)
     return (folder / JOURNAL_NAME).read_bytes()
 
 
 def test_appended_lines_are_read_back(tmp_path):
-    content = filled(tmp_path, 3)
-    with open_journal(tmp_path, HEAD) as journal:
-        assert journal.lines == lines(3) and journal.message is None
+    content = write_journal(tmp_path, 3)
+    with open_journal(tmp_path, HEADER) as journal:
+        assert journal.lines == make_lines(3) and journal.message is None
     assert (tmp_path / JOURNAL_NAME).read_bytes() == content
 
 
-def test_torn_last_line_is_cut_off_at_any_byte(tmp_path):
-    content = filled(tmp_path, 2)
+def test_incomplete_last_line_is_removed(tmp_path):
+    content = write_journal(tmp_path, 2)
     first = content.index(b"\n") + 1
     for size in range(len(content)):
         (tmp_path / JOURNAL_NAME).write_bytes(content[:size])
-        with open_journal(tmp_path, HEAD) as journal:
-            whole = content[:size].count(b"\n")
-            assert journal.lines == lines(2)[: max(whole - 1, 0)]
-            torn = size not in (0, first) and content[size - 1 : size] != b"\n"
-            assert (journal.message is not None) == torn
+        with open_journal(tmp_path, HEADER) as journal:
+            complete_lines = content[:size].count(b"\n")
+            assert journal.lines == make_lines(2)[: max(complete_lines - 1, 0)]
+            is_incomplete = size not in (0, first) and content[size - 1 : size] != b"\n"
+            assert (journal.message is not None) == is_incomplete
             journal.append({"seq": len(journal.lines) + 1, "do": "undo"})
-        with open_journal(tmp_path, HEAD) as journal:
+        with open_journal(tmp_path, HEADER) as journal:
             assert journal.lines[-1]["do"] == "undo" and journal.message is None
 
 
@@ -72,7 +72,7 @@ def test_kill_while_writing_loses_no_confirmed_action(tmp_path):
                 last = int(text)
                 if last == stop:
                     process.send_signal(signal.SIGKILL)
-        with open_journal(folder, HEAD) as journal:
+        with open_journal(folder, HEADER) as journal:
             assert len(journal.lines) >= last >= stop
             assert [line["seq"] for line in journal.lines] == list(range(1, len(journal.lines) + 1))
 
@@ -80,16 +80,16 @@ def test_kill_while_writing_loses_no_confirmed_action(tmp_path):
 def test_second_process_is_rejected_until_the_first_is_killed(tmp_path):
     with subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], text=True, stdout=subprocess.PIPE) as process:
         process.stdout.readline()
-        with pytest.raises(InputError, match="another process"), open_journal(tmp_path, HEAD):
+        with pytest.raises(InputError, match="another process"), open_journal(tmp_path, HEADER):
             pass
         process.kill()
         process.stdout.read()
-    with open_journal(tmp_path, HEAD) as journal:
+    with open_journal(tmp_path, HEADER) as journal:
         assert journal.lines
 
 
 @pytest.mark.parametrize(
-    "other",
+    "header",
     [
         make_journal_header("other", ["a", "b c"], [1, 2]),
         make_journal_header("drive", ["a"], [1]),
@@ -97,26 +97,26 @@ def test_second_process_is_rejected_until_the_first_is_killed(tmp_path):
         make_journal_header("drive", ["a", "b c"], [1, 3]),
     ],
 )
-def test_journal_of_another_drive_is_rejected_and_kept(tmp_path, other):
-    content = filled(tmp_path, 2)
-    with pytest.raises(InputError, match="another drive"), open_journal(tmp_path, other):
+def test_journal_of_another_drive_is_rejected_unchanged(tmp_path, header):
+    content = write_journal(tmp_path, 2)
+    with pytest.raises(InputError, match="another drive"), open_journal(tmp_path, header):
         pass
     assert (tmp_path / JOURNAL_NAME).read_bytes() == content
 
 
-@pytest.mark.parametrize("broken", [b"\x00\x01", b"[1]\n", b"{}\n", b"no journal"])
-def test_invalid_journal_is_rejected_and_kept(tmp_path, broken):
-    (tmp_path / JOURNAL_NAME).write_bytes(broken)
-    with pytest.raises(InputError), open_journal(tmp_path, HEAD):
+@pytest.mark.parametrize("content", [b"\x00\x01", b"[1]\n", b"{}\n", b"no journal"])
+def test_invalid_journal_is_rejected_unchanged(tmp_path, content):
+    (tmp_path / JOURNAL_NAME).write_bytes(content)
+    with pytest.raises(InputError), open_journal(tmp_path, HEADER):
         pass
-    assert (tmp_path / JOURNAL_NAME).read_bytes() == broken
+    assert (tmp_path / JOURNAL_NAME).read_bytes() == content
 
 
-def test_missing_or_broken_line_is_rejected(tmp_path):
-    content = filled(tmp_path, 3).splitlines(keepends=True)
-    for wrong in (content[:2] + content[3:], [*content[:2], b"{\n", *content[3:]]):
-        (tmp_path / JOURNAL_NAME).write_bytes(b"".join(wrong))
-        with pytest.raises(InputError), open_journal(tmp_path, HEAD):
+def test_missing_or_invalid_line_is_rejected(tmp_path):
+    lines = write_journal(tmp_path, 3).splitlines(keepends=True)
+    for damaged_lines in (lines[:2] + lines[3:], [*lines[:2], b"{\n", *lines[3:]]):
+        (tmp_path / JOURNAL_NAME).write_bytes(b"".join(damaged_lines))
+        with pytest.raises(InputError), open_journal(tmp_path, HEADER):
             pass
 
 
@@ -142,36 +142,36 @@ with open_journal(Path(sys.argv[1]), make_journal_header("drive", ["a", "b c"], 
 def test_full_disk_is_reported_and_writing_continues_later(tmp_path):
     result = subprocess.run([sys.executable, "-c", FULL, str(tmp_path)], text=True, check=True, capture_output=True)
     done, _, message_text = result.stdout.partition(" ")
-    assert "nothing was done" in message_text and int(done) > 3
-    with open_journal(tmp_path, HEAD) as journal:
+    assert "cannot write" in message_text and int(done) > 3
+    with open_journal(tmp_path, HEADER) as journal:
         assert len(journal.lines) == int(done) + 1 and journal.message is None
         assert journal.lines[-1]["do"] == "redo"
 
 
-@pytest.mark.parametrize("replaced", [False, True])
-def test_removed_journal_accepts_no_more_lines(tmp_path, replaced):
-    with open_journal(tmp_path, HEAD) as journal:
-        journal.append(lines(1)[0])
+@pytest.mark.parametrize("is_replaced", [False, True])
+def test_removed_journal_accepts_no_more_lines(tmp_path, is_replaced):
+    with open_journal(tmp_path, HEADER) as journal:
+        journal.append(make_lines(1)[0])
         (tmp_path / JOURNAL_NAME).unlink()
-        if replaced:
+        if is_replaced:
             (tmp_path / JOURNAL_NAME).write_text("other")
         with pytest.raises(InputError, match="removed or replaced"):
-            journal.append(lines(2)[1])
-    assert not replaced or (tmp_path / JOURNAL_NAME).read_text() == "other"
+            journal.append(make_lines(2)[1])
+    assert not is_replaced or (tmp_path / JOURNAL_NAME).read_text() == "other"
 
 
 def test_unwritable_folder_is_reported(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="is a file"), open_journal(tmp_path / "file", HEAD):
+    with pytest.raises(InputError, match="is a file"), open_journal(tmp_path / "file", HEADER):
         pass
     (tmp_path / JOURNAL_NAME).mkdir()
     with pytest.raises(InputError, match="cannot open"):
-        Journal(tmp_path, HEAD)
+        Journal(tmp_path, HEADER)
 
 
 def test_non_finite_numbers_are_not_written(tmp_path):
-    with open_journal(tmp_path, HEAD) as journal, pytest.raises(ValueError):
+    with open_journal(tmp_path, HEADER) as journal, pytest.raises(ValueError):
         journal.append({"seq": 1, "box": float("nan")})
     content = (tmp_path / JOURNAL_NAME).read_text()
-    assert [json.loads(line) for line in content.splitlines()] == [HEAD]
+    assert [json.loads(line) for line in content.splitlines()] == [HEADER]
     assert os.listdir(tmp_path) == [JOURNAL_NAME]

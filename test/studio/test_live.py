@@ -72,10 +72,10 @@ def test_frame_waits_for_its_boxes_and_late_ones_are_counted(live, monkeypatch):
     live.add_cloud(cloud(30))
     monkeypatch.setattr(live_graph, "MAX_WAIT_S", 0.0)
     live.update()
-    assert list_shown_frames(live)[-1] == 2 and live.layers(2, 0.0)["detections"] == {}
+    assert list_shown_frames(live)[-1] == 2 and live.make_layers(2, 0.0)["detections"] == {}
     live.add_boxes(FOUND, boxes(30), None)
     assert list_shown_frames(live)[-2:] == [2, 2]
-    (row,) = live.layers(2, 0.0)["detections"]["fused_detector"]
+    (row,) = live.make_layers(2, 0.0)["detections"]["fused_detector"]
     assert row[:9] == [5, 0, 0, 1, 1, 1, 0, "Car", 0.5] and row[9] == {"pillars": 0.25}
     assert [t["late"] for t in live.get_status()["topics"]] == [1]
 
@@ -83,7 +83,7 @@ def test_frame_waits_for_its_boxes_and_late_ones_are_counted(live, monkeypatch):
 def test_early_boxes_wait_and_unmatched_ones_are_counted(live):
     live.add_boxes(FOUND, boxes(10), None)
     live.add_cloud(cloud(10))
-    assert len(live.layers(0, 0.0)["detections"]["fused_detector"]) == 1
+    assert len(live.make_layers(0, 0.0)["detections"]["fused_detector"]) == 1
     for stamp in range(1000, 1000 + live_graph.MAX_EARLY_ARRAYS + 3):
         live.add_boxes(FOUND, boxes(stamp), None)
     (topic,) = live.get_status()["topics"]
@@ -124,8 +124,8 @@ def test_looping_bag_is_shown_again(live):
     for stamp in (1, 2, 1, 2):
         live.add_cloud(cloud(stamp))
         live.add_boxes(FOUND, boxes(stamp), None)
-    assert list_shown_frames(live) == [0, 0, 1, 2, 3]  # the frame of the first boxes again
-    assert all(live.layers(i, 0.0)["detections"] for i in range(4))
+    assert list_shown_frames(live) == [0, 0, 1, 2, 3]  # that of the first boxes again
+    assert all(live.make_layers(i, 0.0)["detections"] for i in range(4))
 
 
 def test_early_labels_are_matched_when_a_bag_loops(live):
@@ -133,7 +133,7 @@ def test_early_labels_are_matched_when_a_bag_loops(live):
     for stamp in (1, 2, 1, 2):
         live.add_boxes("/ground_truth/detections", boxes(stamp), None)
         live.add_cloud(cloud(stamp))
-    assert all(len(live.layers(i, 0.0)["labels"]) == 1 for i in range(4))
+    assert all(len(live.make_layers(i, 0.0)["labels"]) == 1 for i in range(4))
     assert live.get_status()["topics"][1]["unmatched"] == 0
 
 
@@ -142,11 +142,11 @@ def test_missing_tf_is_reported_and_invalid_boxes_left_out(live):
     live.add_boxes(FOUND, boxes(1, "base_link"), None)
     (line,) = live.get_status()["lines"]
     assert FOUND in line and "TF does not connect 'base_link' with 'velodyne'" in line
-    assert live.layers(0, 0.0)["detections"] == {}
+    assert live.make_layers(0, 0.0)["detections"] == {}
     wrong = boxes(1, ids=(1, 2, 3, 4))
     wrong.boxes[0, 0], wrong.boxes[1, 4], wrong.scores[2] = np.nan, 0.0, np.inf
     live.add_boxes(FOUND, wrong, None)
-    assert len(live.layers(0, 0.0)["detections"]["fused_detector"]) == 1
+    assert len(live.make_layers(0, 0.0)["detections"]["fused_detector"]) == 1
     assert live.get_status()["lines"] == []
 
 
@@ -200,7 +200,7 @@ def test_two_trackers_have_distinct_ids_and_misses_are_counted(live):
         live.add_boxes(topic, boxes(1), None)
     live.add_boxes(FOUND, boxes(1, x=50.0), None)
     assert len({t["id"] for t in live.list_tracks()}) == 2
-    match = live.layers(0, 0.0)["matches"]["fused_detector"]
+    match = live.make_layers(0, 0.0)["matches"]["fused_detector"]
     assert match == {"missed": [0], "false": None, "ignored_labels": [], "ignored": None}
     live.forget_topic(TRACKED)  # replaced by another graph
     live.expect_topic("/c/tracker/output/tracks", TRACKS)
@@ -281,7 +281,7 @@ def test_requests_while_topics_change_are_thread_safe(live):
         while not over.is_set():
             try:
                 live.get_status(), live.list_frames(), live.list_tracks(), live.first
-                live.layers(live.end - 1, 0.0)
+                live.make_layers(live.end - 1, 0.0)
             except InputError:
                 pass  # no longer stored
             except Exception as error:

@@ -1,4 +1,4 @@
-"""Merging of proposals with existing tracks, without a drive."""
+"""Tests of merging proposals with existing tracks, without a drive."""
 
 from __future__ import annotations
 
@@ -15,70 +15,70 @@ from lidar_studio.proposer import merge_proposals
 from lidar_studio.state import KEY, PROPOSED, Box, State, Track
 from lidar_studio.survey import FrameSurvey
 
-MOTION = Motion.of(np.arange(8) * 10**8)
+MOTION = Motion.from_stamps(np.arange(8) * 10**8)
 
 
-def straight(x, y, frames, kind=PROPOSED, **more):
-    """A track of an object that does not move."""
+def make_static_track(x, y, frames, kind=PROPOSED, **fields):
+    """Return a track of an object that does not move."""
     boxes = {f: Box((x, y, -1.0, 0.8, 0.6, 1.7, 0.0), kind) for f in frames}
-    return Track(0, "Pedestrian", boxes=boxes, **{"source": "fused", **more})
+    return Track(0, "Pedestrian", boxes=boxes, **{"source": "fused", **fields})
 
 
-def with_id(track, number, **more):
-    return replace(track, id=number, **more)
+def with_id(track, track_id, **fields):
+    return replace(track, id=track_id, **fields)
 
 
-def test_proposals_keep_ids_and_edits_of_the_user():
-    old = {
-        1: with_id(straight(5, 0, range(8)), 1),
-        2: with_id(straight(9, 0, range(8)), 2, state="rejected"),
-        3: with_id(straight(20, 0, range(8)), 3),
-        4: with_id(straight(30, 0, [2], kind=KEY), 4, state="accepted", source="click"),
-        5: with_id(straight(40, 0, range(8)), 5, source="imported"),
+def test_new_proposals_keep_ids_and_manual_edits():
+    old_tracks = {
+        1: with_id(make_static_track(5, 0, range(8)), 1),
+        2: with_id(make_static_track(9, 0, range(8)), 2, state="rejected"),
+        3: with_id(make_static_track(20, 0, range(8)), 3),
+        4: with_id(make_static_track(30, 0, [2], kind=KEY), 4, state="accepted", source="click"),
+        5: with_id(make_static_track(40, 0, range(8)), 5, source="imported"),
     }
-    state = State(old, next_id=6)
-    new = [
-        straight(5.1, 0, range(8)),
-        straight(9.1, 0, range(8)),
-        straight(30.1, 0, range(6)),
-        straight(50, 0, range(8)),
-        straight(40, 0.1, range(8)),
+    state = State(old_tracks, next_id=6)
+    proposals = [
+        make_static_track(5.1, 0, range(8)),
+        make_static_track(9.1, 0, range(8)),
+        make_static_track(30.1, 0, range(6)),
+        make_static_track(50, 0, range(8)),
+        make_static_track(40, 0.1, range(8)),
     ]
-    tracks, removed = merge_proposals(state, new, MOTION)
-    found = {t.id: t for t in tracks}
-    assert removed == [3] and found.keys() == {1, 4, 6}
-    assert found[1].boxes == new[0].boxes and found[6].boxes == new[3].boxes
-    assert found[4].state == "accepted" and found[4].boxes.keys() == set(range(6))
-    again = State({**{n: t for n, t in old.items() if n != 3}, **found}, next_id=7)
-    assert merge_proposals(again, new, MOTION) == ([], [])
+    changed_tracks, removed_ids = merge_proposals(state, proposals, MOTION)
+    tracks = {t.id: t for t in changed_tracks}
+    assert removed_ids == [3] and tracks.keys() == {1, 4, 6}
+    assert tracks[1].boxes == proposals[0].boxes and tracks[6].boxes == proposals[3].boxes
+    assert tracks[4].state == "accepted" and tracks[4].boxes.keys() == set(range(6))
+    merged_state = State({**{n: t for n, t in old_tracks.items() if n != 3}, **tracks}, next_id=7)
+    assert merge_proposals(merged_state, proposals, MOTION) == ([], [])
 
 
 def test_single_boxes_without_a_click_are_not_tracked():
-    old = {
-        n: with_id(straight(5, 0, [n], kind=KEY), n, state="accepted", source=source)
+    tracks = {
+        n: with_id(make_static_track(5, 0, [n], kind=KEY), n, state="accepted", source=source)
         for n, source in enumerate(("imported", "fused", "person"), 1)
     }
-    assert merge_proposals(State(old, next_id=4), [straight(5, 0, range(8))], MOTION) == ([], [])
+    assert merge_proposals(State(tracks, next_id=4), [make_static_track(5, 0, range(8))], MOTION) == ([], [])
 
 
 @pytest.mark.parametrize(
-    "work", [{"do": "class", "track": 1, "class": "Cyclist"}, {"do": "split", "track": 1, "frame": 4}]
+    "edit", [{"do": "class", "track": 1, "class": "Cyclist"}, {"do": "split", "track": 1, "frame": 4}]
 )
-def test_proposals_do_not_change_edited_tracks(work):
-    state, _ = apply(State({1: with_id(straight(5, 0, range(8)), 1)}, next_id=2), work, MOTION)
-    assert merge_proposals(state, [straight(5, 0, range(8))], MOTION) == ([], [])
+def test_proposals_do_not_change_edited_tracks(edit):
+    state, _ = apply(State({1: with_id(make_static_track(5, 0, range(8)), 1)}, next_id=2), edit, MOTION)
+    assert merge_proposals(state, [make_static_track(5, 0, range(8))], MOTION) == ([], [])
 
 
-def test_trimmed_click_is_not_tracked_beyond_the_cut():
-    near = with_id(straight(5, 0, [2, 4], source="click"), 1, state="accepted", nearby=True)
-    near = replace(near, boxes=near.boxes | straight(5, 0, [3], kind=KEY).boxes)
-    state, _ = apply(State({1: near}, next_id=2), {"do": "trim", "track": 1, "frame": 3, "side": "after"}, MOTION)
-    (found,), _ = merge_proposals(state, [straight(5, 0, range(8))], MOTION)
-    assert sorted(found.boxes) == [0, 1, 2, 3] and not found.nearby
+def test_trimmed_track_is_not_extended_beyond_the_trim():
+    track = with_id(make_static_track(5, 0, [2, 4], source="click"), 1, state="accepted", is_partly_tracked=True)
+    track = replace(track, boxes=track.boxes | make_static_track(5, 0, [3], kind=KEY).boxes)
+    state, _ = apply(State({1: track}, next_id=2), {"do": "trim", "track": 1, "frame": 3, "side": "after"}, MOTION)
+    (extended_track,), _ = merge_proposals(state, [make_static_track(5, 0, range(8))], MOTION)
+    assert sorted(extended_track.boxes) == [0, 1, 2, 3] and not extended_track.is_partly_tracked
 
 
-def test_two_clicks_in_one_frame_are_both_found():
+def test_both_of_two_clicks_in_one_frame_become_objects():
     survey = FrameSurvey(Detections.none(), np.zeros((0, 7)), np.zeros((0, 80), np.uint32), {}, np.zeros((0, 7)))
-    both = [(np.array([x, 0.0, -1, 0.8, 0.6, 1.7, 0]), "Pedestrian") for x in (5.0, 9.0)]
-    found, _ = find_objects(survey, ProposalRequest(), both)
-    assert found.boxes[:, 0].tolist() == [5.0, 9.0]
+    placed_boxes = [(np.array([x, 0.0, -1, 0.8, 0.6, 1.7, 0]), "Pedestrian") for x in (5.0, 9.0)]
+    objects, _ = find_objects(survey, ProposalRequest(), placed_boxes)
+    assert objects.boxes[:, 0].tolist() == [5.0, 9.0]

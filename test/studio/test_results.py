@@ -101,7 +101,7 @@ def test_every_label_and_detection_is_counted_once(labels, detections, classes):
 def test_source_does_not_miss_classes_it_cannot_detect(drive_bag):
     frame = next(iter(open_recording(drive_bag)))
     blind = Source(lambda i, frame: Detections.none(), frozenset(["Pedestrian"]))
-    layers = Results({"blind": blind}).layers(0, frame, 0.3)
+    layers = Results({"blind": blind}).make_layers(0, frame, 0.3)
     names = {layers["labels"][k][7] for k in layers["matches"]["blind"]["missed"]}
     assert names == {"Pedestrian"} and layers["detections"] == {"blind": []}
 
@@ -192,8 +192,8 @@ def test_sources_have_unique_short_names():
     ]
 
 
-def test_error_names_the_missing_result_folder(tmp_path):
-    with pytest.raises(InputError, match="there is no folder"):
+def test_missing_result_folder_is_named(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
         make_file_source(tmp_path / "none")
 
 
