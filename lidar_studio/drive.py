@@ -200,7 +200,7 @@ def select_drive(recording: Recording, sequence: str | None = None) -> Drive:
         raise InputError(f"{recording.path} has {len(names)} drives; choose one with --sequence: {names_text}")
     if sequence is not None and sequence not in names:
         raise InputError(
-            f"{recording.path} has no drive {sequence}; available drives: {names_text}" + did_you_mean(sequence, names)
+            f"{recording.path} has no drive {sequence}; available drives: {names_text}" + suggest_name(sequence, names)
         )
     selected = names[0] if sequence is None else sequence
     frames = [frame for frame in all_frames if frame.sequence == selected]

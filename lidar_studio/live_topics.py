@@ -15,7 +15,7 @@ from lidar_studio.results import CLUSTERED_TOPICS
 ARRAY = "vision_msgs/msg/Detection3DArray"
 # Suffixes of cloud topics in order of preference: topics with more columns first.
 CLOUD_SUFFIXES = tuple(topic.lstrip("/") for topic in (*CLUSTERED_TOPICS, "/ground_segmentation/output/points", POINTS))
-KIND_BY_SUFFIX = {FOUND: BOXES, TRACKED: TRACKS, TRUTH: LABELS}
+KIND_BY_SUFFIX = {DETECTIONS: BOXES, TRACKED: TRACKS, TRUTH: LABELS}
 ARRAY_SUFFIX = "_3d"  # suffix of a Detection3DArray topic with the same boxes as a MarkerArray topic
 
 

@@ -126,7 +126,7 @@ def find_objects(
         if name in CLASSES:
             distances = centre_distances(objects.boxes, box[None])[:, 0]
             is_other = distances > max(SAME_OBJECT_DISTANCE_M, box[3] / 3)
-            objects = objects[is_other].followed_by(Detections.of(box, CLASSES.index(name), PLACED_SCORE))
+            objects = objects[is_other].concatenate(Detections.of(box, CLASSES.index(name), PLACED_SCORE))
             is_candidate = np.append(is_candidate[is_other], False)
     return objects, is_candidate
 
@@ -161,7 +161,7 @@ def _add_similar_objects(
     is_new = (centre_distances(boxes, objects.boxes) > min_distances).all(axis=1)
     classes = np.array([CLASSES.index(seeds[k].class_name) for k in best_seed[likely]], np.int32)
     new_objects = Detections.of(boxes[is_new], classes[is_new], scores.max(axis=0)[likely][is_new])
-    return objects.followed_by(new_objects), np.append(is_candidate, np.ones(int(is_new.sum()), bool))
+    return objects.concatenate(new_objects), np.append(is_candidate, np.ones(int(is_new.sum()), bool))
 
 
 NOT_VEHICLE_IDS = [i for i, kind in enumerate(MODEL_BY_CLASS_ID) if kind != MODEL_BY_CLASS_ID[0]]

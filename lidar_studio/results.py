@@ -254,7 +254,7 @@ def _to_probability(value: Any) -> float:
 
 def get_source_name(topic: str) -> str:
     """Return the name of a topic's node, such as fused_detector for /fused_detector/output/detections."""
-    return topic.strip("/").removesuffix(FOUND)
+    return topic.strip("/").removesuffix(DETECTIONS)
 
 
 def _make_source(detections_by_frame: Mapping[int, Detections]) -> Source:

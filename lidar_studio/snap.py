@@ -85,7 +85,7 @@ def _estimate_ground_height(scan: Scan, box: Array) -> float:
     ground = ground[np.hypot(*(ground[:, :2] - box[:2]).T) < MAX_GROUND_DISTANCE_M]
     if len(ground) < MIN_GROUND_POINTS:
         return np.nan
-    return float(fit_ground_surface(ground, float(np.median(ground[:, 2]))).at(box[None])[0])
+    return float(fit_ground_surface(ground, float(np.median(ground[:, 2]))).height_at(box[None])[0])
 
 
 def resize_box(box: Array, size: Array) -> Array:

@@ -1,7 +1,6 @@
-"""Measure the speed of the page: python page/measure.py URL, with the address that label or view
-printed.
+"""Measure the speed of the page: python page/measure.py URL, where `label` or `view` has printed the URL.
 
-Needs playwright (pip install playwright) and chromium; draws in software, as without a GPU.
+This script requires chromium and playwright (pip install playwright). Drawing uses the CPU only.
 """
 
 from __future__ import annotations
@@ -22,13 +21,13 @@ FLAGS = (
 ).split()
 DRAWING_SCRIPT = """async ([count, movingPoints]) => {
   const { drawStats, limits, moveCamera } = page, durations = [];
-  await new Promise((r) => setTimeout(r, 1000)); // at rest
+  await new Promise((r) => setTimeout(r, 1000)); // until the camera stands still
   limits.movingPoints = movingPoints;
   for (let k = 0; k < count; k++) {
     const start = performance.now(), before = drawStats.count;
     moveCamera(0, 0, 0.02);
     while (drawStats.count === before) await new Promise(requestAnimationFrame);
-    await new Promise(requestAnimationFrame); // once it has been shown
+    await new Promise(requestAnimationFrame); // wait until it is shown
     durations.push(performance.now() - start);
   }
   limits.movingPoints = 30000;
@@ -39,7 +38,7 @@ REDRAWING_SCRIPT = """async (count) => {
   await new Promise((r) => setTimeout(r, 1000));
   for (let k = 0; k < count; k++) {
     const start = performance.now(), before = drawStats.count;
-    draw(); // as after each step of a box that is dragged
+    draw(); // as after each step while a box is dragged
     while (drawStats.count === before) await new Promise(requestAnimationFrame);
     await new Promise(requestAnimationFrame);
     durations.push(performance.now() - start);
@@ -57,15 +56,15 @@ PICKING_SCRIPT = """(count) => {
 }"""
 HOVER_SCRIPT = """async (count) => {
   const scene = document.getElementById("scene"), area = scene.getBoundingClientRect();
-  const { cloud } = page.store, places = new Map(), durations = [];
+  const { cloud } = page.store, positions = new Map(), durations = [];
   for (let i = 0; i < cloud.count; i++) { // one point of each cluster in view
-    if (!cloud.cluster[i] || places.has(cloud.cluster[i])) continue;
-    const at = page.project(...cloud.xyz.subarray(3 * i, 3 * i + 3));
-    if (at && at[0] > 0 && at[1] > 0 && at[0] < area.width && at[1] < area.height) {
-      places.set(cloud.cluster[i], at);
+    if (!cloud.cluster[i] || positions.has(cloud.cluster[i])) continue;
+    const position = page.project(...cloud.xyz.subarray(3 * i, 3 * i + 3));
+    if (position && position[0] > 0 && position[1] > 0 && position[0] < area.width && position[1] < area.height) {
+      positions.set(cloud.cluster[i], position);
     }
   }
-  for (const [x, y] of [...places.values()].slice(0, count)) {
+  for (const [x, y] of [...positions.values()].slice(0, count)) {
     const start = performance.now(), before = page.drawStats.count;
     scene.dispatchEvent(new PointerEvent("pointermove",
                                          { clientX: area.left + x, clientY: area.top + y }));
@@ -82,7 +81,7 @@ NEXT_FRAME_SCRIPT = """async (count) => {
   for (let k = 0; k < count; k++) {
     const goal = page.store.frame + 1;
     if (goal >= page.store.drive.frames.length) break;
-    await new Promise((r) => setTimeout(r, 2500)); // as long as a person looks: the next is fetched
+    await new Promise((r) => setTimeout(r, 2500)); // leave time to prefetch the next frame
     const start = performance.now(), before = page.drawStats.count;
     document.getElementById("next").click();
     while (page.store.frame !== goal || page.drawStats.count === before) {
@@ -95,16 +94,16 @@ NEXT_FRAME_SCRIPT = """async (count) => {
 
 
 def list_processes() -> dict[int, str]:
-    """Return the kind of each browser process by its id: "renderer", "gpu-process" or ""."""
-    found = {}
+    """Return the kinds of all browser processes by id: "renderer", "gpu-process" or "" for others."""
+    kinds = {}
     for folder in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             line = (folder / "cmdline").read_text()
             if "chromium" in line:
-                found[int(folder.name)] = next(
+                kinds[int(folder.name)] = next(
                     (kind for kind in ("renderer", "gpu-process") if f"--type={kind}" in line), ""
                 )
-    return found
+    return kinds
 
 
 def read_cpu_ms(pid: int) -> float:
@@ -122,19 +121,18 @@ def read_memory(pid: int) -> int:
 class MeasuredPage:
     """A page and the processes of its browser."""
 
-    def __init__(self, page: Page, others: set[int]) -> None:
+    def __init__(self, page: Page, other_pids: set[int]) -> None:
         self.page = page
-        own = {pid: kind for pid, kind in list_processes().items() if pid not in others}
-        self.page_pid = max((p for p, kind in own.items() if kind == "renderer"), key=read_memory)
-        self.pids = {"page": self.page_pid, "drawing": next(p for p, kind in own.items() if kind == "gpu-process")}
+        kinds = {pid: kind for pid, kind in list_processes().items() if pid not in other_pids}
+        self.page_pid = max((p for p, kind in kinds.items() if kind == "renderer"), key=read_memory)
+        self.pids = {"page": self.page_pid, "drawing": next(p for p, kind in kinds.items() if kind == "gpu-process")}
 
     def measure(self, title: str, script: str, arguments: object) -> None:
-        """Run a script that returns durations, and print them with the mean CPU time of the page's
-        processes."""
-        before = {name: read_cpu_ms(pid) for name, pid in self.pids.items()}
+        """Run a script that returns durations; print them and the mean CPU time of the page's processes."""
+        start_ms = {name: read_cpu_ms(pid) for name, pid in self.pids.items()}
         result = self.page.evaluate(script, arguments)
         durations, count = sorted(result["durations"]), len(result["durations"])
-        cpu = ", ".join(f"{name} {(read_cpu_ms(pid) - before[name]) / count:.1f}" for name, pid in self.pids.items())
+        cpu = ", ".join(f"{name} {(read_cpu_ms(pid) - start_ms[name]) / count:.1f}" for name, pid in self.pids.items())
         print(
             f"{title}, {result['points']:,} points: median {statistics.median(durations):.1f} ms, "
             f"slowest of {count} {durations[-1]:.1f} ms; mean CPU time in ms: {cpu}",
@@ -142,32 +140,32 @@ class MeasuredPage:
         )
 
     def measure_playback(self) -> None:
-        """Play to the last frame, and print the duration and the memory."""
+        """Play to the last frame; print the duration and the memory usage."""
         page, max_memory = self.page, 0
-        first, start = page.evaluate("page.store.frame"), monotonic()
-        last = page.evaluate("page.store.drive.frames.length - 1")
+        first_frame, start = page.evaluate("page.store.frame"), monotonic()
+        last_frame = page.evaluate("page.store.drive.frames.length - 1")
         page.locator("#scene").focus()
         page.keyboard.press(" ")
-        while page.evaluate("page.store.frame") < last:
+        while page.evaluate("page.store.frame") < last_frame:
             page.wait_for_timeout(1000)
             max_memory = max(max_memory, read_memory(self.page_pid))
-        mean = 1e3 * (monotonic() - start) / max(last - first, 1)
+        mean_ms = 1e3 * (monotonic() - start) / max(last_frame - first_frame, 1)
         page.wait_for_timeout(2000)
         print(
-            f"played {last - first} frames, {mean:.0f} ms each; memory of the page at most "
+            f"played {last_frame - first_frame} frames, {mean_ms:.0f} ms each; memory of the page at most "
             f"{max_memory / 1e6:.0f} MB, at the end {read_memory(self.page_pid) / 1e6:.0f} MB"
         )
 
 
 def main() -> None:
-    others = set(list_processes())
+    other_pids = set(list_processes())
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
         page = browser.new_page(viewport={"width": 1280, "height": 720})
         page.goto(sys.argv[1])
         page.wait_for_selector("html[data-ready=true]", state="attached")
         page.wait_for_timeout(2000)
-        measured = MeasuredPage(page, others)
+        measured = MeasuredPage(page, other_pids)
         measured.measure("drawing while the camera moves", DRAWING_SCRIPT, [40, 30_000])
         measured.measure("drawing all points", DRAWING_SCRIPT, [20, 10**9])
         measured.measure("drawing while the camera stands still", REDRAWING_SCRIPT, 40)

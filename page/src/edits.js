@@ -92,7 +92,7 @@ export function setClass(name) {
   return null;
 }
 
-export const setTrackClass = (name) => actOnTrack({ do: "class", class: name });
+export const setTrackClass = (name) => sendTrackAction({ do: "class", class: name });
 
 /** Reject all undecided tracks in the list (of the class that the list is filtered by) as one action. */
 export async function rejectRest() {
@@ -111,11 +111,11 @@ export const countUndecided = (className) => [...store.tracks.values()].filter((
 export const getNewClass = () => store.newClass
   ?? (findClass("Pedestrian") ? "Pedestrian" : store.drive.classes[0]?.name ?? "Pedestrian");
 
-export const snap = (to) => actOnTrack({ do: "snap", frame: store.frame, to });
-export const removeBox = () => actOnTrack({ do: "remove_box", frame: store.frame });
+export const snap = (to) => sendTrackAction({ do: "snap", frame: store.frame, to });
+export const removeBox = () => sendTrackAction({ do: "remove_box", frame: store.frame });
 /** Remove the boxes "before" or "after" this frame. */
-export const trim = (side) => actOnTrack({ do: "trim", frame: store.frame, side });
-export const split = () => actOnTrack({ do: "split", frame: store.frame });
+export const trim = (side) => sendTrackAction({ do: "trim", frame: store.frame, side });
+export const split = () => sendTrackAction({ do: "split", frame: store.frame });
 
 /** Copy the box of the selected track in this frame to the next frame, and go to that frame. */
 export async function copyToNextFrame() {

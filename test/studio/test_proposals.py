@@ -123,7 +123,7 @@ def test_clicked_car_is_a_seed_and_similar_cars_are_proposed(session):
     session.propose()
     frame = session.drive.frames[0]
     truth, scan = frame.truth(), session.drive.load_scan(0)
-    cars = truth.of_class(CAR)
+    cars = truth.select_class(CAR)
     points_by_car = [scan.xyz[points_in_box(scan.xyz, b) & (scan.cluster_ids > 0)] for b in cars]
     best = max(range(len(cars)), key=lambda k: len(points_by_car[k]))
     points, car = points_by_car[best], cars[best]
