@@ -246,7 +246,7 @@ def test_boxes_are_transformed_to_the_frame_of_the_clouds(parts, tmp_path):
     recording = recorded(tmp_path / "bag", *map(list, parts), rows)
     frames, poses = recording.frames[:], recording.frames.poses
     if not parts:
-        with pytest.raises(InputError, match="in 'odom', the clouds in 'lidar'"):
+        with pytest.raises(InputError, match="from 'odom' to the frame of the clouds 'lidar'"):
             bag_format.read(tmp_path / "bag", frames, "/n/output/detections")
         assert not results.read_recorded_results(poses, stamps()).sources
         return
