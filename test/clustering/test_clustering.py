@@ -49,9 +49,9 @@ def blobs(rng, centres, size, spread):
 
 
 def assert_same(xyz, eps, min_samples):
-    found = dbscan(xyz, eps, min_samples)
-    assert found.dtype == np.int32 and found.shape == (len(xyz),)
-    np.testing.assert_array_equal(found, reference(xyz, eps, min_samples))
+    result = dbscan(xyz, eps, min_samples)
+    assert result.dtype == np.int32 and result.shape == (len(xyz),)
+    np.testing.assert_array_equal(result, reference(xyz, eps, min_samples))
 
 
 @given(
@@ -120,9 +120,9 @@ def test_labels_equal_sklearn_on_real_clouds(scan):
     raw = np.fromfile(sorted(SCANS.glob("*.bin"))[scan], np.float32).reshape(-1, 4)
     xyz = raw[:, :3][~segment_by_threshold(np.ascontiguousarray(raw[:, :3]))]
     params = DbscanParams()
-    found = distance_aware_dbscan(xyz, params)
-    assert found.max() > 20
-    np.testing.assert_array_equal(found, banded_reference(xyz, params))
+    result = distance_aware_dbscan(xyz, params)
+    assert result.max() > 20
+    np.testing.assert_array_equal(result, banded_reference(xyz, params))
 
 
 def banded_reference(xyz, params):
@@ -132,8 +132,8 @@ def banded_reference(xyz, params):
     labels, last = np.zeros(len(xyz), int), 0
     for low, high, eps in zip(limits, limits[1:], params.eps):
         members = (ranges >= low) & (ranges < high)
-        found = reference(xyz[members], eps, params.min_samples)
-        labels[members] = np.where(found > 0, found + last, 0)
+        result = reference(xyz[members], eps, params.min_samples)
+        labels[members] = np.where(result > 0, result + last, 0)
         last = labels.max(initial=0)
     return labels
 
@@ -187,11 +187,11 @@ def test_join_bands_joins_touching_clusters_only(seed, count):
     xyz = (rng.uniform(-6, 6, (count, 3)) * [1, 1, 0.1]).astype(np.float32)
     cut = DbscanParams(range_limits=(2.0, 4.0), eps=(0.9, 0.7, 1.0), min_samples=3)
     labels = distance_aware_dbscan(xyz, cut)
-    found = distance_aware_dbscan(xyz, DbscanParams(cut.range_limits, cut.eps, 3, join_bands=True))
-    assert partition(found) == slow_join(xyz, labels, cut)
-    np.testing.assert_array_equal(found > 0, labels > 0)
-    first = [np.flatnonzero(found == k)[0] for k in range(1, found.max(initial=0) + 1)]
-    assert len(set(found.tolist()) - {0}) == len(first)
+    result = distance_aware_dbscan(xyz, DbscanParams(cut.range_limits, cut.eps, 3, join_bands=True))
+    assert partition(result) == slow_join(xyz, labels, cut)
+    np.testing.assert_array_equal(result > 0, labels > 0)
+    first = [np.flatnonzero(result == k)[0] for k in range(1, result.max(initial=0) + 1)]
+    assert len(set(result.tolist()) - {0}) == len(first)
 
 
 def test_join_bands_reunites_a_cluster_across_a_limit():
@@ -213,9 +213,9 @@ def test_an_outlier_100_km_away_does_not_change_clusters(far):
     xyz = np.random.default_rng(7).uniform(-2, 2, (800, 3)).astype(np.float32)
     labels = dbscan(xyz, 0.4, 5)
     for place in (0, 400, 800):
-        found = dbscan(np.insert(xyz, place, np.float32(far), axis=0), 0.4, 5)
-        assert found[place] == 0
-        np.testing.assert_array_equal(np.delete(found, place), labels)
+        result = dbscan(np.insert(xyz, place, np.float32(far), axis=0), 0.4, 5)
+        assert result[place] == 0
+        np.testing.assert_array_equal(np.delete(result, place), labels)
     banded = distance_aware_dbscan(np.concatenate([xyz, np.float32([far])]))
     np.testing.assert_array_equal(banded[:-1], distance_aware_dbscan(xyz))
 

@@ -36,10 +36,10 @@ def plain(xyz, radius, limit):
 def test_consistent_points_equal_plain_numpy():
     xyz = np.concatenate(wall_and_bush())[::10]
     radii = np.full(len(xyz), 0.5)
-    found = find_consistent_points(xyz, radii, 0.02, MAX_WORK)
-    assert 0.1 < found.mean() < 0.9
-    np.testing.assert_array_equal(found, plain(xyz, 0.5, 0.02))
-    assert (find_consistent_points(xyz, radii, 0.02, 1000) == found).mean() > 0.5  # estimated from 1000 points
+    result = find_consistent_points(xyz, radii, 0.02, MAX_WORK)
+    assert 0.1 < result.mean() < 0.9
+    np.testing.assert_array_equal(result, plain(xyz, 0.5, 0.02))
+    assert (find_consistent_points(xyz, radii, 0.02, 1000) == result).mean() > 0.5  # estimated from 1000 points
 
 
 @pytest.mark.parametrize("max_distances", [2**15, 0], ids=["grid", "tree"])

@@ -67,8 +67,8 @@ def test_density_matches_angular_resolution(elevation_step, azimuth_step):
     expected = 1 / (elevation_step * azimuth_step * slant)
     # Cells at the border of the view, or with every second beam, are only half filled, so the density is too
     # low there.
-    found = measure_density(make_scan(elevation_step, azimuth_step, np.random.default_rng(3)))
-    assert found == pytest.approx(expected, rel=0.12, abs=0.3)
+    result = measure_density(make_scan(elevation_step, azimuth_step, np.random.default_rng(3)))
+    assert result == pytest.approx(expected, rel=0.12, abs=0.3)
 
 
 @pytest.fixture(scope="module")
@@ -120,8 +120,8 @@ def test_sparser_clouds_get_wider_radii_and_smaller_sizes(a, b):
 def test_radii_grow_with_the_range():
     ranges = np.array([0.1, 5.0, 10.0, 20.0, 40.0, 80.0])
     xyz = np.column_stack([ranges, np.zeros((6, 2))]).astype(np.float32)
-    found = compute_radii(xyz, 1.5, 0.5, 1.3)
-    assert found.min() == 0.5 and found.max() == 1.3 and (np.diff(found) >= 0).all()
+    result = compute_radii(xyz, 1.5, 0.5, 1.3)
+    assert result.min() == 0.5 and result.max() == 1.3 and (np.diff(result) >= 0).all()
     unlimited = compute_radii(xyz, 1.5, 0.0, 99.0)
     assert compute_radii(xyz, 6.0, 0.0, 99.0) == pytest.approx(unlimited / 2)
 
@@ -142,9 +142,9 @@ def test_points_with_different_radii_cluster_as_if_separate():
 @pytest.mark.parametrize("params", ADAPTIVE, ids=["PointNet", "experts", "people"])
 def test_clusters_of_an_hdl_64e_ignore_the_density(params, scan):
     ground = np.isin(scan.semantic, (40, 44, 48, 49, 60, 72))
-    found = cluster_obstacles(scan.frame.xyz, ground, params)
-    assert found.max() > 20
-    np.testing.assert_array_equal(found, cluster_obstacles(scan.frame.xyz, ground, replace(params, density=0.0)))
+    result = cluster_obstacles(scan.frame.xyz, ground, params)
+    assert result.max() > 20
+    np.testing.assert_array_equal(result, cluster_obstacles(scan.frame.xyz, ground, replace(params, density=0.0)))
 
 
 @needs_data

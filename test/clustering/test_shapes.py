@@ -74,8 +74,8 @@ def angle_between(a, b, period=np.pi):
 
 def assert_rotated(before, after, angle, atol):
     """Assert that `after` is `before` rotated about z, with corners in any order."""
-    found, expected = box_corners(np.stack([after, before]))[:, :4]
-    distances = np.linalg.norm(found[:, None] - rotate(expected, angle), axis=2)
+    result, expected = box_corners(np.stack([after, before]))[:, :4]
+    distances = np.linalg.norm(result[:, None] - rotate(expected, angle), axis=2)
     assert distances.min(axis=1).max() < atol and distances.min(axis=0).max() < atol
 
 
@@ -295,9 +295,9 @@ def test_boxes_of_real_cars_have_the_yaw_of_the_cars():
         xyz = frame.load().xyz
         for car in frame.truth().select_class(CLASSES.index("Car")):
             inside = xyz[points_in_box(xyz, car)]
-            for shape, found in errors.items() if len(inside) >= 30 else ():
+            for shape, result in errors.items() if len(inside) >= 30 else ():
                 yaw = apply_to_one(fit_boxes, inside, shape)[6]
-                found.append(np.degrees(angle_between(yaw, car[6], np.pi / 2)))
+                result.append(np.degrees(angle_between(yaw, car[6], np.pi / 2)))
     assert len(errors["l_shape"]) > 100
     assert np.median(errors["l_shape"]) < 1 and np.percentile(errors["l_shape"], 90) < 6
     assert np.mean(errors["l_shape"]) < np.mean(errors["min_area"])

@@ -81,10 +81,12 @@ def test_every_search_equals_brute_force(data):
         (0.0, squared <= np.maximum(reach2[:, None], reach2)),
         (2.0, np.sqrt(squared) < 2.0 * (reach2[:, None] + reach2) / 2),
     ):
-        found = find_components(tree, reach2, selected, gamma, np.inf)[0]
+        result = find_components(tree, reach2, selected, gamma, np.inf)[0]
         sets = connected_components(coo_matrix(linked & selected & selected[:, None]))[1]
-        assert (found[~selected] == -1).all() and (found[selected] >= 0).all()
-        np.testing.assert_array_equal(found[selected, None] == found[selected], sets[selected, None] == sets[selected])
+        assert (result[~selected] == -1).all() and (result[selected] >= 0).all()
+        np.testing.assert_array_equal(
+            result[selected, None] == result[selected], sets[selected, None] == sets[selected]
+        )
     nearest = find_nearest_core_points(tree, reach2, selected)[0]
     for i in range(n):
         within = [(squared[i, j], *tree.points[j]) for j in np.flatnonzero(selected & (squared[i] <= reach2))]

@@ -88,15 +88,15 @@ def climbing_road(seed=0):
 
 def test_climbing_road_is_ground_and_cars_on_it_are_not():
     xyz, road = climbing_road()
-    found = segment_by_cloth(xyz)
-    assert found[road].mean() > 0.97 and found[~road].mean() < 0.1
+    result = segment_by_cloth(xyz)
+    assert result[road].mean() > 0.97 and result[~road].mean() < 0.1
     # The same holds where reflections far below the road pull the cloth down.
     rng = np.random.default_rng(1)
     below = rng.choice(xyz[road & (xyz[:, 0] > 12)], 12) - np.float32([0, 0, 1])
     below[:, 2] -= rng.uniform(0, 9, 12)
     deep = np.concatenate([xyz, below, below + np.float32([0.6, 0, 0.2])])
-    found = segment_by_cloth(deep)
-    assert found[: len(xyz)][road].mean() > 0.97 and not found[len(xyz) :].any()
+    result = segment_by_cloth(deep)
+    assert result[: len(xyz)][road].mean() > 0.97 and not result[len(xyz) :].any()
     assert segment_by_cloth(deep, ClothParams(slope=0.0))[: len(xyz)][road].mean() > 0.9
 
 
@@ -122,8 +122,8 @@ def test_climbing_cells_equal_a_plain_implementation(seed, slope):
         if not new:
             break
         touched |= new
-    found = find_climbing_cells(lowest, height, float(np.float32(0.1)), slope)
-    assert {tuple(cell) for cell in np.argwhere(found)} == {
+    result = find_climbing_cells(lowest, height, float(np.float32(0.1)), slope)
+    assert {tuple(cell) for cell in np.argwhere(result)} == {
         (r, c) for r, c in touched if lowest[r, c] > np.float32(0.1)
     }
 
@@ -148,8 +148,8 @@ def test_a_hill_too_curved_for_a_plane_is_ground():
     xy = rng.uniform(-40, 40, (40_000, 2))
     hill = np.column_stack([xy, 2.5 * np.cos(xy[:, 0] / 12) * np.cos(xy[:, 1] / 15)])
     post = rng.uniform(-0.2, 0.2, (200, 3)) * [1, 1, 5] + [10, 10, 3]
-    found = segment_by_cloth(np.concatenate([hill, post]).astype(np.float32))
-    assert found[: len(hill)].mean() > 0.99 and found[len(hill) :].mean() < 0.2
+    result = segment_by_cloth(np.concatenate([hill, post]).astype(np.float32))
+    assert result[: len(hill)].mean() > 0.99 and result[len(hill) :].mean() < 0.2
 
 
 @given(st.integers(0, 2**31))
@@ -171,24 +171,24 @@ def test_rotating_about_z_rotates_the_ground(degrees, same):
 @pytest.mark.parametrize("far", [[1e5, 0, 0], [0, -9e4, 50], [0, 101, -1.7], [95, 80, 30], [-99, 3, -8]])
 def test_a_far_outlier_does_not_change_the_ground(far):
     xyz, _ = street(4)
-    found = segment_by_cloth(np.concatenate([xyz, np.float32([far])]))[:-1]
-    assert (found != segment_by_cloth(xyz)).mean() < 1e-3
+    result = segment_by_cloth(np.concatenate([xyz, np.float32([far])]))[:-1]
+    assert (result != segment_by_cloth(xyz)).mean() < 1e-3
 
 
 def test_reflections_below_the_ground_do_not_move_it():
     xyz, _ = street(5)
     below = np.column_stack([np.random.default_rng(0).uniform(-30, 30, (40, 2)), np.full(40, -4.0)]).astype(np.float32)
-    found = segment_by_cloth(np.concatenate([xyz, below]))
-    assert not found[-40:].any()
-    assert (found[:-40] != segment_by_cloth(xyz)).mean() < 0.002
+    result = segment_by_cloth(np.concatenate([xyz, below]))
+    assert not result[-40:].any()
+    assert (result[:-40] != segment_by_cloth(xyz)).mean() < 0.002
 
 
 def test_points_beyond_max_range_are_ignored():
     xyz, road = street(6)
     params = ClothParams(max_range=15)
     inside = (np.abs(xyz[:, :2]) <= 15).all(axis=1)
-    found = segment_by_cloth(xyz, params)
-    assert not found[~inside].any() and f1(found, road & inside) > 0.99
+    result = segment_by_cloth(xyz, params)
+    assert not result[~inside].any() and f1(result, road & inside) > 0.99
     cells = 2**5
     assert lay_cloth(xyz, params).height.size <= (2 * 15 / 0.5 + 2 * cells) ** 2
 
@@ -205,8 +205,8 @@ def test_points_beyond_max_range_are_ignored():
     ids=["empty", "one point", "far", "all equal", "column"],
 )
 def test_clouds_of_few_points_are_segmented(xyz, expected):
-    found = segment_by_cloth(np.asarray(xyz, np.float32).reshape(-1, 3))
-    assert found.dtype == bool and found.tolist() == expected
+    result = segment_by_cloth(np.asarray(xyz, np.float32).reshape(-1, 3))
+    assert result.dtype == bool and result.tolist() == expected
 
 
 def test_ground_hardly_depends_on_cloth_resolution():

@@ -33,10 +33,10 @@ def test_height_is_above_the_nearest_cell_with_ground(seed, count, reach):
     rng = np.random.default_rng(seed)
     xyz, ground = make_cloud(rng, 50), make_cloud(rng, count)
     far = np.float32([reach, -reach, 0])
-    for found, heights in zip(
+    for result, heights in zip(
         compute_height_above_ground(xyz + far, ground + far), plain_heights(xyz + far, ground + far), strict=True
     ):
-        assert np.abs(heights - found).min() <= 1e-9
+        assert np.abs(heights - result).min() <= 1e-9
 
 
 @given(st.integers(0, 10_000), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
@@ -46,8 +46,8 @@ def test_error_on_a_slope_is_at_most_the_rise_of_a_cell(seed, a, b):
     xy = rng.uniform(-5, 5, (4000, 2))
     ground = np.column_stack([xy, xy @ [a, b] - 1.73])
     high = rng.uniform(0, 3, len(xy))
-    found = compute_height_above_ground(ground + np.column_stack([0 * xy, high]), ground)
-    assert np.abs(found - high).max() <= CELL_M * (abs(a) + abs(b)) + 1e-9
+    result = compute_height_above_ground(ground + np.column_stack([0 * xy, high]), ground)
+    assert np.abs(result - high).max() <= CELL_M * (abs(a) + abs(b)) + 1e-9
 
 
 def test_obstacles_are_non_ground_points_within_the_band():
@@ -57,12 +57,12 @@ def test_obstacles_are_non_ground_points_within_the_band():
     height = np.full(len(xyz), np.nan)
     height[~ground] = compute_height_above_ground(xyz[~ground], xyz[ground])
     for low, high in ((0.2, 0), (0, 5), (0.2, 5)):
-        found = find_obstacles(xyz, ground, ObstacleParams(low, high))
+        result = find_obstacles(xyz, ground, ObstacleParams(low, high))
         expected = (height >= (low or -np.inf)) & (height <= (high or np.inf))
-        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(result, expected)
         order = rng.permutation(len(xyz))
         np.testing.assert_array_equal(
-            find_obstacles(xyz[order], ground[order], ObstacleParams(low, high)), found[order]
+            find_obstacles(xyz[order], ground[order], ObstacleParams(low, high)), result[order]
         )
 
 

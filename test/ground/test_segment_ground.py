@@ -50,10 +50,10 @@ BAD = {
 def test_mask_has_the_length_of_any_invalid_cloud(method, name):
     xyz = np.asarray(BAD[name], np.float32)
     for intensity in (None, np.zeros(len(xyz), np.float32)):
-        found = segment(xyz, method, intensity)
-        assert found.dtype == bool and found.shape == (len(xyz),)
+        result = segment(xyz, method, intensity)
+        assert result.dtype == bool and result.shape == (len(xyz),)
     if name in ("origin", "all NaN", "all infinite"):
-        assert not found.any()
+        assert not result.any()
 
 
 @each_method
@@ -65,9 +65,9 @@ def test_unusable_points_do_not_affect_the_others(method):
     mixed = np.insert(xyz, at, bad[rng.integers(0, 5, 500)], axis=0)
     is_bad = np.insert(np.zeros(len(xyz), bool), at, True)
     intensity = rng.random(len(mixed)).astype(np.float32)
-    found = segment(mixed, method, intensity)
-    assert not found[is_bad].any()
-    np.testing.assert_array_equal(found[~is_bad], segment(xyz, method, intensity[~is_bad]))
+    result = segment(mixed, method, intensity)
+    assert not result[is_bad].any()
+    np.testing.assert_array_equal(result[~is_bad], segment(xyz, method, intensity[~is_bad]))
 
 
 @each_method
@@ -92,8 +92,8 @@ def test_tilted_sensor_gives_the_ground_of_a_level_one(method, roll, pitch):
     axes = level_points(np.eye(3, dtype=np.float32), pose)  # rows: the levelled axes
     tilted = xyz @ axes.T
     np.testing.assert_allclose(level_points(tilted, pose), xyz, atol=1e-4)
-    found = segment(tilted, method, sensor_pose=pose)
-    assert (found == segment(xyz, method)).mean() > 0.995
+    result = segment(tilted, method, sensor_pose=pose)
+    assert (result == segment(xyz, method)).mean() > 0.995
 
 
 def test_pitch_and_roll_rotate_as_in_a_urdf():
@@ -112,9 +112,9 @@ def run_library(xyz, intensity, height=1.73, rnr=True):
     settings.sensor_height, settings.enable_RNR = height, rnr
     engine = pypatchworkpp.patchworkpp(settings)
     engine.estimateGround(np.column_stack([xyz, intensity]).astype(np.float32))
-    found = np.zeros(len(xyz), bool)
-    found[engine.getGroundIndices()] = True
-    return found
+    result = np.zeros(len(xyz), bool)
+    result[engine.getGroundIndices()] = True
+    return result
 
 
 def hilly_scene(seed):
@@ -139,9 +139,9 @@ def hilly_scene(seed):
 def test_patchwork_equals_the_library_but_for_rounding(seed, rnr):
     xyz, intensity = hilly_scene(seed)
     expected = run_library(xyz, intensity, rnr=rnr)
-    found = segment_by_patchwork(xyz, intensity if rnr else None, 1.73)
+    result = segment_by_patchwork(xyz, intensity if rnr else None, 1.73)
     assert 0.2 < expected.mean() < 0.8
-    assert (found != expected).mean() < 1e-4
+    assert (result != expected).mean() < 1e-4
 
 
 @needs_data
@@ -151,12 +151,12 @@ def test_patchwork_equals_the_library_on_a_real_scan():
     off = GroundParams(method="patchwork", patchwork=PatchworkParams(remove_reflections=False))
     with_rnr, without = (run_library(frame.xyz, frame.intensity, rnr=r) for r in (True, False))
     assert (with_rnr != without).any()
-    for found, expected in (
+    for result, expected in (
         (segment_ground(frame, params), with_rnr),
         (segment_ground(PointCloud(frame.xyz), params), without),
         (segment_ground(frame, off), without),
     ):
-        assert (found != expected).sum() <= 20  # of 124,668 points, due to rounding at limits
+        assert (result != expected).sum() <= 20  # of 124,668 points, due to rounding at limits
 
 
 @needs_data
@@ -164,8 +164,8 @@ def test_patchwork_equals_the_library_on_a_real_scan():
 def test_permuting_points_of_a_real_scan_permutes_the_ground(method):
     frame = open_recording(DATA / "semantickitti").frames[0].load()
     order = np.random.default_rng(0).permutation(len(frame))
-    found = segment(frame.xyz, method)
-    assert (segment(frame.xyz[order], method) == found[order]).mean() > 0.99
+    result = segment(frame.xyz, method)
+    assert (segment(frame.xyz[order], method) == result[order]).mean() > 0.99
 
 
 @each_method

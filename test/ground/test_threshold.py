@@ -53,9 +53,9 @@ def real_scans(*numbers):
 def test_the_plane_is_accurate_with_40_percent_outliers(seed, a, b, c):
     true = np.array([a, b, c])
     xyz = sloped_scene(seed, true)
-    found = fit_plane_by_ransac(xyz, ThresholdParams(max_height=100.0))
-    assert angle_between(found, true) < 0.1
-    assert abs(found[2] - true[2]) < 0.01
+    result = fit_plane_by_ransac(xyz, ThresholdParams(max_height=100.0))
+    assert angle_between(result, true) < 0.1
+    assert abs(result[2] - true[2]) < 0.01
 
 
 @given(st.integers(0, 2**31), slopes, slopes)
@@ -120,9 +120,9 @@ def test_plane_of_a_real_cloud_equals_sklearn_ransac(scan):
         plane, before = fit_plane(low[near]), plane
         if np.array_equal(plane, before):
             break
-    found = fit_plane_by_ransac(low, params)
-    assert angle_between(found, plane) < 0.1
-    assert abs(found[2] - plane[2]) < 0.01
+    result = fit_plane_by_ransac(low, params)
+    assert angle_between(result, plane) < 0.1
+    assert abs(result[2] - plane[2]) < 0.01
 
 
 @needs_data

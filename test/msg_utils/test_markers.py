@@ -60,7 +60,7 @@ def same_boxes(a, b) -> bool:
 @each_make
 @given(rows=objects, remarks=notes)
 def test_marker_array_round_trip(make, rows, remarks):
-    got = from_marker_array(
+    result = from_marker_array(
         array(
             make,
             rows,
@@ -70,13 +70,13 @@ def test_marker_array_round_trip(make, rows, remarks):
             ids=range(7, 7 + len(rows)),
         )
     )
-    assert same_boxes(got.boxes, [r[0] for r in rows])
-    assert got.labels == [r[1] for r in rows]
-    assert got.scores.tolist() == [r[2] for r in rows]
-    assert got.extras == [{**r[3], "score": r[2]} for r in rows]
-    assert got.notes == remarks
-    assert got.ids.tolist() == list(range(7, 7 + len(rows)))
-    assert (got.stamp_ns, got.frame_id) == (STAMP, "velodyne")
+    assert same_boxes(result.boxes, [r[0] for r in rows])
+    assert result.labels == [r[1] for r in rows]
+    assert result.scores.tolist() == [r[2] for r in rows]
+    assert result.extras == [{**r[3], "score": r[2]} for r in rows]
+    assert result.notes == remarks
+    assert result.ids.tolist() == list(range(7, 7 + len(rows)))
+    assert (result.stamp_ns, result.frame_id) == (STAMP, "velodyne")
 
 
 @given(rows=objects, remarks=notes)
@@ -118,16 +118,16 @@ def test_only_outdated_markers_are_deleted(make, before, after):
 @each_make
 def test_empty_array_keeps_frame_and_stamp(make):
     msg = array(make, [])
-    got = from_marker_array(msg)
-    assert len(got) == 0 and got.boxes.shape == (0, 7) and got.notes == []
-    assert (got.stamp_ns, got.frame_id) == (STAMP, "velodyne")
+    result = from_marker_array(msg)
+    assert len(result) == 0 and result.boxes.shape == (0, 7) and result.notes == []
+    assert (result.stamp_ns, result.frame_id) == (STAMP, "velodyne")
     assert list_marker_keys(msg) == frozenset()
 
 
 @each_make
 def test_a_message_without_markers_is_empty(make):
-    got = from_marker_array(make("visualization_msgs/msg/MarkerArray", markers=[]))
-    assert (len(got), got.stamp_ns, got.frame_id) == (0, 0, "")
+    result = from_marker_array(make("visualization_msgs/msg/MarkerArray", markers=[]))
+    assert (len(result), result.stamp_ns, result.frame_id) == (0, 0, "")
 
 
 @each_make
@@ -162,12 +162,12 @@ def test_cubes_of_other_nodes_are_read(make, text, score, extra):
     )
     sphere = make("visualization_msgs/msg/Marker", header=header(make), type=2, action=ADD)
     clear = make("visualization_msgs/msg/Marker", action=3)  # DELETEALL, often without a header
-    got = from_marker_array(make("visualization_msgs/msg/MarkerArray", markers=[clear, cube, sphere]))
-    assert same_boxes(got.boxes, [[1, 2, 3, 4, 5, 6, -2.0]])
-    assert (got.labels, got.ids.tolist(), got.frame_id, got.stamp_ns) == (["car"], [4], "map", 5)
-    assert got.scores.tolist() == [score] and got.extras == [extra]
-    assert CLASSES[to_truth(got).class_ids[0]] == "Car"
-    assert to_detections(got).scores.tolist() == [score]
+    result = from_marker_array(make("visualization_msgs/msg/MarkerArray", markers=[clear, cube, sphere]))
+    assert same_boxes(result.boxes, [[1, 2, 3, 4, 5, 6, -2.0]])
+    assert (result.labels, result.ids.tolist(), result.frame_id, result.stamp_ns) == (["car"], [4], "map", 5)
+    assert result.scores.tolist() == [score] and result.extras == [extra]
+    assert CLASSES[to_truth(result).class_ids[0]] == "Car"
+    assert to_detections(result).scores.tolist() == [score]
 
 
 @each_make
@@ -190,9 +190,9 @@ def test_lifetime_and_color_reach_every_cube(make):
 def test_track_id_is_kept_if_it_distinguishes_labels(make, tracks, ids):
     extras = [{} if t is None else {"track_id": t} for t in tracks]
     truth = GroundTruth.of(np.ones((len(tracks), 7)), [0] * len(tracks), extras, [("DontCare", {"track_id": -1})])
-    got = from_marker_array(make_truth_markers(truth, header(make), make))
-    assert got.ids.tolist() == ids
-    assert to_truth(got).extras == truth.extras and to_truth(got).notes == truth.notes
+    result = from_marker_array(make_truth_markers(truth, header(make), make))
+    assert result.ids.tolist() == ids
+    assert to_truth(result).extras == truth.extras and to_truth(result).notes == truth.notes
 
 
 @given(rows=objects)
@@ -205,14 +205,14 @@ def test_detection_array_round_trip(rows):
         make=codec.make_bag_message,
     )
     for read in (msg, codec.decode(codec.encode(msg), "vision_msgs/msg/Detection3DArray")):
-        got = from_detection_array(read)
+        result = from_detection_array(read)
         assert [d.id for d in read.detections] == [str(i) for i in range(len(rows))]
-        assert got.ids.tolist() == list(range(len(rows))) and got.extras == [{}] * len(rows)
+        assert result.ids.tolist() == list(range(len(rows))) and result.extras == [{}] * len(rows)
         assert not any(np.any(r.pose.covariance) for d in read.detections for r in d.results)
-        assert same_boxes(got.boxes, [r[0] for r in rows])
-        assert got.labels == [r[1] for r in rows]
-        assert got.scores.tolist() == [r[2] for r in rows]
-        assert (got.stamp_ns, got.frame_id) == (STAMP, "velodyne")
+        assert same_boxes(result.boxes, [r[0] for r in rows])
+        assert result.labels == [r[1] for r in rows]
+        assert result.scores.tolist() == [r[2] for r in rows]
+        assert (result.stamp_ns, result.frame_id) == (STAMP, "velodyne")
 
 
 def test_detection_has_its_most_likely_class():
@@ -221,5 +221,5 @@ def test_detection_has_its_most_likely_class():
     )
     msg.detections[0].results.extend(msg.detections[1].results)
     msg.detections[1].results.clear()
-    got = from_detection_array(msg)
-    assert (got.labels, got.scores.tolist()) == (["Van", ""], [0.5, 1.0])
+    result = from_detection_array(msg)
+    assert (result.labels, result.scores.tolist()) == (["Van", ""], [0.5, 1.0])

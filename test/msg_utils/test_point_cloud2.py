@@ -120,9 +120,9 @@ def same(a: np.ndarray, b: np.ndarray) -> bool:
 @each_make
 @given(cloud=points())
 def test_array_round_trip(make, cloud):
-    got = to_array(from_array(cloud, header(make), make))
-    assert got.dtype == cloud.dtype
-    assert got.tobytes() == cloud.tobytes()
+    result = to_array(from_array(cloud, header(make), make))
+    assert result.dtype == cloud.dtype
+    assert result.tobytes() == cloud.tobytes()
 
 
 @each_make
@@ -163,8 +163,8 @@ def test_the_last_row_needs_no_padding(make):
 def test_fields_without_a_name_are_padding(make):
     fields = [field(make, "", 0, 2, 4), field(make, "x", 4), field(make, "", 8, 2, 4)]
     data = np.array([9.0, 1.5, 9.0, 9.0, 2.5, 9.0], "<f4").view(np.uint8)
-    got = to_array(message(make, fields, data, width=2, point_step=12))
-    assert got.dtype.names == ("x",) and got["x"].tolist() == [1.5, 2.5]
+    result = to_array(message(make, fields, data, width=2, point_step=12))
+    assert result.dtype.names == ("x",) and result["x"].tolist() == [1.5, 2.5]
 
 
 @each_make
@@ -189,11 +189,11 @@ def test_add_columns_keeps_existing_bytes_and_fields(make, cloud, height, pad):
     new = add_columns(
         old, make, label=np.arange(len(cloud), dtype=np.uint16), score=np.linspace(0, 1, len(cloud), dtype=np.float32)
     )
-    got = to_array(new)
-    assert got.dtype.names == (*cloud.dtype.names, "label", "score")
-    assert same(got[list(cloud.dtype.names)], cloud)
-    assert got["label"].tolist() == list(range(len(cloud)))
-    assert got["score"].tolist() == np.linspace(0, 1, len(cloud), dtype=np.float32).tolist()
+    result = to_array(new)
+    assert result.dtype.names == (*cloud.dtype.names, "label", "score")
+    assert same(result[list(cloud.dtype.names)], cloud)
+    assert result["label"].tolist() == list(range(len(cloud)))
+    assert result["score"].tolist() == np.linspace(0, 1, len(cloud), dtype=np.float32).tolist()
     raw = np.frombuffer(new.data, np.uint8).reshape(len(cloud), new.point_step)
     assert raw[:, :step].tobytes() == cloud.tobytes()
     assert list(new.fields[: len(old.fields)]) == list(old.fields)
@@ -221,18 +221,18 @@ def test_a_column_of_another_shape_or_type_is_replaced(make, old, order):
     dtype = np.dtype([("x", "<f4"), old, ("y", "<f8")]).newbyteorder(order)
     cloud = np.zeros(3, dtype)
     cloud["x"], cloud["y"] = [1, 2, 3], [4, 5, 6]
-    got = to_array(add_columns(from_array(cloud, header(make), make), make, i=np.array([7, 8, 9], np.int32)))
-    assert got.dtype["i"] == np.dtype(f"{order}i4") and got["i"].tolist() == [7, 8, 9]
-    assert sorted(got.dtype.names) == ["i", "x", "y"]
-    assert same(got[["x", "y"]], cloud[["x", "y"]])
+    result = to_array(add_columns(from_array(cloud, header(make), make), make, i=np.array([7, 8, 9], np.int32)))
+    assert result.dtype["i"] == np.dtype(f"{order}i4") and result["i"].tolist() == [7, 8, 9]
+    assert sorted(result.dtype.names) == ["i", "x", "y"]
+    assert same(result[["x", "y"]], cloud[["x", "y"]])
 
 
 @each_make
 def test_an_empty_cloud_stays_empty(make):
     empty = message(make, [], np.zeros(0, np.uint8), width=0, point_step=0)
     assert len(to_array(empty)) == 0
-    got = to_array(add_columns(empty, make, label=np.zeros(0, np.uint8)))
-    assert len(got) == 0 and got.dtype.names == ("label",)
+    result = to_array(add_columns(empty, make, label=np.zeros(0, np.uint8)))
+    assert len(result) == 0 and result.dtype.names == ("label",)
     assert read_xyz(to_array(from_array(np.zeros(0, XYZ), header(make), make))).shape == (0, 3)
 
 
@@ -241,9 +241,9 @@ def test_an_empty_cloud_stays_empty(make):
 def test_xyz_reads_any_floating_point_cloud(make, kind):
     cloud = np.zeros(2, [("z", kind), ("ring", kind[0] + "u2"), ("y", kind), ("x", kind)])
     cloud["x"], cloud["y"], cloud["z"] = [1, np.nan], [3, np.inf], [5, 6]
-    got = read_xyz(to_array(from_array(cloud, header(make), make)))
-    assert got.dtype == np.float32 and got.flags.c_contiguous
-    np.testing.assert_array_equal(got, [[1, 3, 5], [np.nan, np.inf, 6]])
+    result = read_xyz(to_array(from_array(cloud, header(make), make)))
+    assert result.dtype == np.float32 and result.flags.c_contiguous
+    np.testing.assert_array_equal(result, [[1, 3, 5], [np.nan, np.inf, 6]])
 
 
 def test_columns_are_returned_in_the_requested_order():

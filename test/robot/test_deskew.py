@@ -39,8 +39,8 @@ def test_deskew_equals_loop_over_points():
             position = position + middle.apply(velocity * t / steps)
             attitude = attitude * Rotation.from_rotvec(rotation * t / steps)
         expected.append(attitude.apply(point) + position)
-    found = deskew(xyz, seconds, make_constant_motion(velocity, rotation))
-    np.testing.assert_allclose(found[:40], expected, atol=3e-3)  # at most MAX_POSES poses per sweep
+    result = deskew(xyz, seconds, make_constant_motion(velocity, rotation))
+    np.testing.assert_allclose(result[:40], expected, atol=3e-3)  # at most MAX_POSES poses per sweep
     assert np.abs(np.array(expected) - xyz[:40]).max() > 0.5
 
 
@@ -49,8 +49,8 @@ def test_points_of_static_sensor_do_not_move():
     pose = np.tile(np.eye(4), (1, 1, 1))
     pose[0, :3, :3] = Rotation.from_rotvec([0.3, 1.0, -2.0]).as_matrix()
     pose[0, :3, 3] = 4e5, -3e4, 100.0
-    found = deskew(xyz, seconds, lambda at: np.repeat(pose, len(at), axis=0))
-    np.testing.assert_allclose(found, xyz, atol=1e-5)
+    result = deskew(xyz, seconds, lambda at: np.repeat(pose, len(at), axis=0))
+    np.testing.assert_allclose(result, xyz, atol=1e-5)
     np.testing.assert_array_equal(deskew(xyz, seconds, make_constant_motion(np.zeros(3), np.zeros(3))), xyz)
     poses = make_constant_motion([20.0, 0, 0], [0, 0, 1.0])
     np.testing.assert_array_equal(deskew(xyz, np.zeros(len(xyz)), poses), xyz)

@@ -110,11 +110,11 @@ def test_max_gap_extrapolates_last_two_poses(seed, seconds):
     last, beyond = int(times[-1]), round(seconds * SECOND_NS)
     before, now = (tree.lookup("odom", "base", t) for t in (int(times[-2]), last))
     step = invert_pose(before) @ now
-    found = tree.lookup("odom", "base", last + beyond, 0.5)
+    result = tree.lookup("odom", "base", last + beyond, 0.5)
     turn = Rotation.from_rotvec(Rotation.from_matrix(step[:3, :3]).as_rotvec() * seconds / 0.02)
-    np.testing.assert_allclose(found[:3, :3], now[:3, :3] @ turn.as_matrix(), atol=1e-6)
+    np.testing.assert_allclose(result[:3, :3], now[:3, :3] @ turn.as_matrix(), atol=1e-6)
     velocity = (now - before)[:3, 3] / 0.02
-    np.testing.assert_allclose(found[:3, 3], now[:3, 3] + velocity * seconds, atol=1e-6)
+    np.testing.assert_allclose(result[:3, 3], now[:3, 3] + velocity * seconds, atol=1e-6)
     np.testing.assert_array_equal(tree.lookup("odom", "base", last, 0.5), tree.lookup("odom", "base", last))
 
 

@@ -66,9 +66,9 @@ def test_encoded_markers_equal_the_serialized_message(rows, stamp_ns, frame_id, 
 
 def test_encoded_tracks_equal_the_serialized_message():
     tracker, trails, shown = Tracker(), Trails(), ()
-    for i, found in enumerate(crowd(4, 15)):
+    for i, frame_detections in enumerate(crowd(4, 15)):
         stamp = START + i * TENTH
-        tracks = tracker(found if i < 12 else Detections.none(), stamp)
+        tracks = tracker(frame_detections if i < 12 else Detections.none(), stamp)
         track_rows = make_track_rows(
             tracks.ids,
             tracks.detections,
@@ -78,7 +78,7 @@ def test_encoded_tracks_equal_the_serialized_message():
             previous=shown,
         )
         shown = list_marker_keys(track_rows)
-        for rows in (track_rows, make_detection_rows(found)):
+        for rows in (track_rows, make_detection_rows(frame_detections)):
             assert_equal_cdr(encode_markers(rows, header(make_bag_message, stamp)), rows, stamp)
     assert shown
 

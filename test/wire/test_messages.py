@@ -118,8 +118,8 @@ def test_message_fields_default_to_zero_as_in_ros(name):
     if name.endswith(("Pose", "Marker")):  # ROS initialises the unit quaternion
         pose = theirs if name.endswith("Pose") else theirs.pose
         pose.orientation.w = 0.0
-    got = serialization.deserialize_message(encode(make_bag_message(name)), load_message_class(name))
-    assert got == theirs
+    result = serialization.deserialize_message(encode(make_bag_message(name)), load_message_class(name))
+    assert result == theirs
 
 
 def test_unknown_field_raises_type_error():

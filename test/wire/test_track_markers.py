@@ -20,9 +20,9 @@ from msg_utils.markers import ADD, DELETE, from_marker_array, list_marker_keys
 def make_frames(make, frames=20):
     """Yield the tracks and markers of each frame; each array gets the previous one."""
     tracker, trails, shown = Tracker(), Trails(), ()
-    for i, found in enumerate(crowd(4, frames)):
+    for i, frame_detections in enumerate(crowd(4, frames)):
         stamp = START + i * TENTH
-        tracks = tracker(found if i < 12 else Detections.none(), stamp)
+        tracks = tracker(frame_detections if i < 12 else Detections.none(), stamp)
         message = make_track_markers(
             tracks.ids,
             tracks.detections,
@@ -43,9 +43,9 @@ def test_tracks_are_read_back_from_their_markers(make):
     for tracks, message in make_frames(make):
         objects = from_marker_array(message)
         assert objects.ids.tolist() == tracks.ids.tolist()
-        found = to_detections(objects)
-        np.testing.assert_array_equal(found.boxes[:, :6], tracks.detections.boxes[:, :6])
-        np.testing.assert_array_equal(found.scores, tracks.detections.scores)
+        frame_detections = to_detections(objects)
+        np.testing.assert_array_equal(frame_detections.boxes[:, :6], tracks.detections.boxes[:, :6])
+        np.testing.assert_array_equal(frame_detections.scores, tracks.detections.scores)
         velocities = np.reshape([e["velocity"] for e in objects.extras], (-1, 2))
         np.testing.assert_allclose(velocities, tracks.velocities, atol=1e-3)
         for m in message.markers:
@@ -72,10 +72,10 @@ def test_each_array_deletes_outdated_markers(make):
 
 
 def test_large_ids_wrap_around():
-    found = Detections.of([[1, 2, 3, 4, 5, 6, 0]], CAR, 0.5)
+    frame_detections = Detections.of([[1, 2, 3, 4, 5, 6, 0]], CAR, 0.5)
     message = make_track_markers(
         np.array([MAX_ID + 7]),
-        found,
+        frame_detections,
         np.zeros((1, 2)),
         np.zeros(1),
         [np.zeros((1, 3))],
