@@ -17,7 +17,7 @@ from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
 from lidar_perception.detectors.pointnet.clusters import Clusters, make_clusters, make_network_input
 from lidar_perception.detectors.pointnet.config import make_pointnet_config
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
-from lidar_perception.detectors.pointnet.network import fuse_norms, make_pointnet
+from lidar_perception.detectors.pointnet.network import PointNet, fuse_norms
 from lidar_perception.detectors.pointnet.params import STEPS
 from lidar_perception.detectors.pointnet.predict import predict
 from lidar_perception.detectors.pointnet.torch_network import TorchPointNet
@@ -39,13 +39,11 @@ def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:
     torch.manual_seed(0)
     config = make_pointnet_config()
     networks = {
-        name: TorchPointNet(fuse_norms(make_pointnet(make_pointnet_config(name))))
+        name: TorchPointNet(fuse_norms(PointNet(make_pointnet_config(name))))
         for name in ("improved", "pointnet2", "pointnet")
     }
     plain = PlainPointNet2(config).eval()
-    detector = PointNetDetector(
-        PointNetClassifier(TorchPointNet(fuse_norms(make_pointnet(config)), "auto"), Header(config))
-    )
+    detector = PointNetDetector(PointNetClassifier(TorchPointNet(fuse_norms(PointNet(config)), "auto"), Header(config)))
     detector.warm_up()
     rows, steps, counts = [], [], []
     for scan in scans:

@@ -33,6 +33,7 @@ MIN_NAME_SIMILARITY = 0.6  # minimum similarity of a misspelt name to the right 
 MIN_PREFIX = 3  # number of first characters that a misspelt name must share with the right one
 MAX_NUMBER = 1e9  # larger numbers in labels are considered corrupt
 SENSOR_HEIGHT = 1.73  # height of KITTI's sensor above the road in metres; default of anchors and simulation
+EMPTY_CLOUD = "the cloud is empty, has no finite point, or crop.* removes all of its points"
 
 
 class InputError(ValueError):

@@ -133,7 +133,7 @@ class Proposer:
         Returns:
             The proposed tracks, or None if cancelled.
         """
-        silhouettes = [SilhouetteSeed(seed.silhouette(BEST), seed.height) for seed in self.find_seeds(state)]
+        silhouettes = [SilhouetteSeed(seed.draw_silhouette(BEST), seed.height) for seed in self.find_seeds(state)]
         sizes = [SizeSeed(t.class_name, _get_size(t, f)) for f, t in self._find_size_seeds(state)]
         placed_boxes: dict[int, list[tuple[Array, str]]] = {}
         for t in state.tracks.values():
@@ -170,7 +170,7 @@ class Proposer:
     def cut_seed(self, box: Array, frame: int) -> Seed | None:
         """Make a seed from the points in a box (7,) of a frame, or return None if there are too few."""
         try:
-            return seed_from_points(self._select_points(frame, box), box, certain=True)
+            return seed_from_points(self._select_points(frame, box), box, is_confirmed=True)
         except InputError:
             return None
 
@@ -190,7 +190,7 @@ class Proposer:
         candidate = None if box is None else self.cut_seed(np.array(box.values), frame)
         if candidate is None:
             raise InputError(f"track {track.id} has too few points in frame {frame} for a silhouette")
-        image, templates = candidate.silhouette(BEST), [seed.silhouette(BEST) for seed in seeds]
+        image, templates = candidate.draw_silhouette(BEST), [seed.draw_silhouette(BEST) for seed in seeds]
         scores = [float(compute_similarity(image[None], t, BEST.stm)[0]) for t in templates]
         best_index = int(np.argmax(scores))
         return {

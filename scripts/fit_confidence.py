@@ -59,7 +59,7 @@ def collect_samples(frame: Frame, seed: Seed, params: PipelineParams) -> dict | 
     points, start = group_points(segmented.xyz, segmented.cluster_ids, ids)
     features = compute_shape_features(points, start, boxes, params)
     images = draw_silhouettes(points, start, np.ones((len(boxes), 1)), boxes[:, 2] - boxes[:, 5] / 2, params)
-    features["similarity"] = compute_similarity(images, seed.silhouette(params), params.stm)
+    features["similarity"] = compute_similarity(images, seed.draw_silhouette(params), params.stm)
     features["height_difference_m"] = np.abs(features["height_m"] - seed.height)
     hit_indices, _ = match_centres(boxes, truth)
     return {

@@ -31,7 +31,7 @@ from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointnet.network import load_pointnet
 from lidar_perception.detectors.pointpillars.network import load_network
-from lidar_perception.detectors.weights_file import JUDGE, POINTNET_WEIGHTS, POINTPILLARS_WEIGHTS
+from lidar_perception.detectors.weights_file import CLASSIFIER, POINTNET_WEIGHTS, POINTPILLARS_WEIGHTS
 from lidar_perception.runs.files import write_text
 from lidar_perception.runs.terminal import console
 from lidar_perception.scoring.detections import measure_detector
@@ -55,7 +55,7 @@ FAILURES = {  # network -> known failures
     ],
     POINTNET: [*SENSOR_FAILURES, "Missed: people in one cluster with walls or other people, far cyclists."],
 }
-JUDGE_NOTE = (
+CLASSIFIER_NOTE = (
     "Use: classifies the boxes that PointPillars proposes in `fused`. Alone, `pointnet` finds real cars better."
 )
 
@@ -103,7 +103,7 @@ def describe_weights(header: checkpoint.Header, title: str) -> list[str]:
     start = f", starting from {init}" if init else ""
     return [
         f"Network: {header.network} {config.title}".rstrip() + "; the header of the file has the full config.",
-        *([JUDGE_NOTE] if title == Path(JUDGE).stem else []),
+        *([CLASSIFIER_NOTE] if title == Path(CLASSIFIER).stem else []),
         f"Training data: {', '.join(training['data'])}, {training['scenes']} scenes; "
         + (f"validation on {others} others." if others else "no validation.")
         + (" Simulated streets only, no real scan." if training["data"] == ["sim"] else ""),
@@ -196,7 +196,7 @@ def main(weights: Path, folders: tuple[Path, ...], second_path: Path | None, jud
             },
         )
     if header.network == POINTNET:
-        out = POINTNET_WEIGHTS.with_name(JUDGE) if judge else POINTNET_WEIGHTS
+        out = POINTNET_WEIGHTS.with_name(CLASSIFIER) if judge else POINTNET_WEIGHTS
     else:
         out = POINTPILLARS_WEIGHTS / f"pointpillars_{header.config.version}_{header.config.size}.safetensors"
     out.parent.mkdir(exist_ok=True)

@@ -1,8 +1,8 @@
 """Confidence of a candidate: the probability that a cluster is a pedestrian.
 
-It depends on the cluster's shape and, with a seed, on the similarity to the seed. The log-odds are
-a sum of one curve per feature, given by its values at a few knots. confidence.json holds the
-curves, which were fitted to simulated scans only (scripts/fit_confidence.py).
+It depends on the cluster's shape and, if there is a seed, on the similarity to the seed. The
+log-odds are the sum of one piecewise linear curve per feature. The curves are in confidence.json;
+they were fitted to simulated scans only (scripts/fit_confidence.py).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from lidar_perception.candidates.silhouette import (
 )
 from lidar_perception.geometry import quantile
 
-SHAPE_KNOTS = {  # feature -> knots of its curve, which is constant beyond the first and the last
+SHAPE_KNOTS = {  # feature -> knots of its curve, which is constant beyond the first and last knot
     "range_m": (5, 10, 15, 20, 30, 40, 55),
     "height_m": (0.8, 1.2, 1.5, 1.65, 1.8, 1.95, 2.1, 2.5),
     "length_m": (0.2, 0.4, 0.6, 0.8, 1.0, 1.3, 2.0),
@@ -46,7 +46,7 @@ PIXEL_AREA_M2 = WINDOW_HEIGHT_M / ROWS * WINDOW_WIDTH_M / COLUMNS
 def compute_shape_features(
     xyz: np.ndarray, start: np.ndarray, boxes: np.ndarray, params: PipelineParams = PipelineParams()
 ) -> dict[str, np.ndarray]:
-    """Compute the features of SHAPE_KNOTS of K clusters.
+    """Compute the features in SHAPE_KNOTS for K clusters.
 
     Args:
         xyz: (N, 3) points, sorted by cluster.
@@ -57,15 +57,16 @@ def compute_shape_features(
     Returns:
         Arrays (K,) float64 by name:
         range_m: Horizontal range of the centroid.
-        height_m: Height of the top above the ground plus half a beam step, because the true top is
-            between two beams.
+        height_m: Height of the highest point above the ground plus half the distance between two
+            beams, because the actual top is between two beams.
         length_m, width_m: Extents along and across the widest direction in x-y.
         area_m2: Number of points times the surface area per point.
-        hidden_below_m: Height of the lowest point above the ground, minus a beam step.
+        hidden_below_m: Height of the lowest point above the ground, minus the distance between two
+            beams.
         upright: Vertical spread: standard deviation of z divided by the height.
-        fill: Area of the silhouette divided by height x length.
-        lopsided: Skew of the points: distance of the median from the middle of the extent, divided
-            by the length.
+        fill: Filled fraction: area of the silhouette divided by height x length.
+        lopsided: Asymmetry along the length: distance of the median from the middle of the extent,
+            divided by the length.
     """
     stm = replace(params.stm, window="metric", spread=True, dilations=0, axis="yaw")
     floors = boxes[:, 2].astype(float) - boxes[:, 5] / 2
@@ -95,7 +96,7 @@ def compute_shape_features(
 def compute_confidence(
     shape: dict[str, np.ndarray], similarity: np.ndarray | None = None, height_difference: np.ndarray | None = None
 ) -> np.ndarray:
-    """Compute the probability (K,) float64, 0..1, that each cluster is a pedestrian.
+    """Compute the probability (K,) float64 that each cluster is a pedestrian.
 
     The probability is calibrated on simulated scans with the same distribution of pedestrians over
     range as KITTI's labels (paper A, Table 1).
@@ -103,8 +104,7 @@ def compute_confidence(
     Args:
         shape: Result of compute_shape_features.
         similarity: (K,) similarity to a seed, or None.
-        height_difference: (K,) difference to the height of the seed, metres, or None. Give both or
-            neither.
+        height_difference: (K,) height difference to the seed, metres; None if `similarity` is None.
     """
     features = dict(shape)
     if similarity is not None and height_difference is not None:
@@ -117,9 +117,9 @@ def compute_log_odds(model: Mapping[str, Any], features: Mapping[str, np.ndarray
     """Compute the log-odds (K,) float64 of K objects.
 
     Args:
-        model: `bias`, and `curves` with the `knots` and `values` of each feature. A curve is
-            constant beyond its first and last knot. A feature that is NaN adds the `unknown` value
-            of its curve, 0 by default.
+        model: `bias`, and `curves` with the `knots` and `values` of each feature. Curves are
+            constant beyond their first and last knot. For a feature that is NaN, the `unknown`
+            value of its curve is added, by default 0.
         features: Arrays (K,) by name.
     """
     log_odds = np.full(len(next(iter(features.values()))), float(model["bias"]))
@@ -136,11 +136,11 @@ def _load_models() -> dict[str, Any]:
 
 @njit(cache=True)
 def _compute_moments(xyz, start):
-    """Return seven features of each cluster, (K, 7).
+    """Compute seven features of each cluster, (K, 7).
 
-    They are the horizontal range of the centroid, the lowest and highest z, the standard deviation
-    of z, the extents along and across the widest direction, and the distance of the median from the
-    middle of the extent along it.
+    The columns are the horizontal range of the centroid, the lowest and highest z, the standard
+    deviation of z, the extents along and across the widest direction, and the distance between
+    median and middle of the extent in this direction.
     """
     moments = np.zeros((len(start) - 1, 7))
     for k in range(len(start) - 1):

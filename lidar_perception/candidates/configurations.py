@@ -6,9 +6,9 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.clustering.params import FULL_DENSITY
 from lidar_perception.param_fields import with_values
 
-# Paper A's protocol: points in the camera's view, the nearest labelled pedestrian as seed. The
-# defaults of params.py are the paper's numbers; its height threshold alone removes the ground
-# (Section 3.2), which fails on slopes, so it is not the default.
+# Paper A's protocol: points in the camera's view, and the nearest labelled pedestrian as seed. The
+# other values in the paper are the defaults of params.py. The paper removes the ground by a height
+# threshold alone (Section 3.2); this fails on slopes, so it is not the default.
 PAPER_VALUES = {
     "view.enabled": True,
     "seed.source": "ground_truth",
@@ -16,8 +16,8 @@ PAPER_VALUES = {
     "boxes.plane": "ransac",
 }
 
-# These values found most pedestrians on frames that they were not tuned on, with every seed source.
-# docs/how-to/evaluate.md has the figures.
+# With these values the pipeline found the most pedestrians, with every seed source, in frames that
+# they were not tuned on; docs/how-to/evaluate.md has the results.
 BEST_VALUES = {
     "ground.threshold.separate": "plane",
     "boxes.plane": "least_squares",
@@ -26,16 +26,16 @@ BEST_VALUES = {
     "clustering.dbscan.eps": (0.15, 0.30, 0.50, 0.70),
     "clustering.dbscan.min_samples": 5,
     "clustering.dbscan.join_bands": True,
-    "height.tolerance": 0.6,  # only saves time: the confidence accounts for the height
+    "height.tolerance": 0.6,  # only saves time, because the confidence already depends on the height
     "stm.window": "metric",
     "stm.spread": True,
     "stm.dilations": 0,
     "stm.seen_only": True,
     "stm.shifts": 2,
-    "cpa.steps": 0,  # points drawn with `spread` need no copies
+    "cpa.steps": 0,  # copies are not needed for points drawn with `spread`
     "confidence.enabled": True,
     "confidence.threshold": 0.25,
-    "seed.min_confidence": 0.9,  # below this, the template is the better seed
+    "seed.min_confidence": 0.9,  # if no cluster reaches this, the template is the better seed
 }
 PAPER = with_values(PipelineParams(), PAPER_VALUES)
 BEST = with_values(PAPER, BEST_VALUES)

@@ -1,4 +1,4 @@
-"""Parameters of the pedestrian candidates of paper A and of the complete pipeline."""
+"""Parameters of the candidate pipeline of paper A."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class HeightParams(Params):
     """Height filter (paper A, Section 3.5)."""
 
     tolerance: float = param(
-        0.2, "Maximum difference between the height of a candidate and that of the seed.", unit="m", low=0.0, high=100.0
+        0.2, "Maximum height difference between a candidate and the seed.", unit="m", low=0.0, high=100.0
     )
 
 
@@ -25,7 +25,9 @@ class ResolutionParams(Params):
     """Angular resolution of the sensor; defaults for the HDL-64E of KITTI."""
 
     elevation_step: float = param(0.43, "Angle between neighbouring beams.", unit="deg", low=0.01, high=20.0)
-    azimuth_step: float = param(0.17, "Angle between neighbouring points of a beam.", unit="deg", low=0.01, high=20.0)
+    azimuth_step: float = param(
+        0.17, "Angle between neighbouring points of the same beam.", unit="deg", low=0.01, high=20.0
+    )
 
 
 SILHOUETTE_WINDOWS = ("stretched", "metric")
@@ -41,8 +43,8 @@ class StmParams(Params):
     )
     window: str = param(
         "stretched",
-        "stretched: the silhouette of a cluster fills the window. "
-        "metric: the window is 1.6 m wide and 2.4 m high, starting at the ground.",
+        "stretched: silhouettes are stretched to fill the window. "
+        "metric: the window is 1.6 m wide and 2.4 m high, and starts at the ground.",
         choices=SILHOUETTE_WINDOWS,
     )
     axis: str = param(
@@ -58,12 +60,12 @@ class StmParams(Params):
     dilations: int = param(1, "Number of 3 x 3 dilations of the silhouette.", low=0, high=10)
     seen_only: bool = param(
         False,
-        "With the metric window: compare only the part above the "
-        "lowest points of both the cluster and the seed, because the part "
-        "below is hidden in one of them.",
+        "With the metric window: compare only the part above the lowest "
+        "points of the cluster and of the seed, because below that one of "
+        "them is hidden.",
     )
     shifts: int = param(
-        0, "Maximum horizontal shift of the silhouette, in columns, to fit that of the seed.", low=0, high=16
+        0, "Maximum horizontal shift of a silhouette, in columns, to match the seed's silhouette.", low=0, high=16
     )
 
 
@@ -88,8 +90,8 @@ class ConfidenceParams(Params):
 
     enabled: bool = param(
         False,
-        "Accept candidates by confidence instead of similarity, and use "
-        "it as the score. The confidence is fitted to the configuration best.",
+        "Accept candidates by confidence instead of similarity, and use the "
+        "confidence as the score. It was fitted with the configuration best.",
     )
     threshold: float = param(0.5, "Minimum confidence of a candidate.", low=0.0, high=1.0)
 
@@ -105,15 +107,15 @@ class SeedParams(Params):
         "file",
         "ground_truth: the nearest labelled Pedestrian of the frame (the "
         "paper's protocol). click: the cluster at /clicked_point. file: a saved "
-        "template. automatic: the cluster of the frame that resembles a "
-        "pedestrian most, or the template if there is none.",
+        "template. automatic: the cluster of the frame that most resembles a "
+        "pedestrian, or the template if there is none.",
         choices=SEED_SOURCES,
     )
     file: str = param("", "Template file for source 'file', or several separated by commas; empty: the shipped one.")
     bank: int = param(
         1,
-        "Number of the last clicks whose seeds are kept for source 'click'. A "
-        "cluster is compared with all seeds; the most similar one counts.",
+        "For source 'click': number of most recent clicks to keep as seeds. "
+        "Clusters are compared with all seeds, and the most similar one counts.",
         low=1,
         high=16,
     )
@@ -123,8 +125,7 @@ class SeedParams(Params):
     )
 
 
-# The steps of the candidate pipeline whose durations are measured, in order.
-STEPS = ("view", "ground", "clustering", "boxes", "height", "stm", "cpa", "confidence")
+STEPS = ("view", "ground", "clustering", "boxes", "height", "stm", "cpa", "confidence")  # keys of the durations
 
 
 @dataclass(frozen=True)

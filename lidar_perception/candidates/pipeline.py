@@ -1,9 +1,8 @@
-"""Candidate pipeline: finds pedestrian candidates in a cloud.
+"""Candidate pipeline, which finds pedestrian candidates in a cloud.
 
     crop, view -> ground -> clusters -> boxes snapped to the ground -> height -> STM -> CPA
 
-The nodes call the same stage functions one by one, so that the graph over DDS gives the same
-candidates.
+The nodes call the same functions, so the ROS graph gives the same candidates.
 """
 
 from __future__ import annotations
@@ -33,17 +32,17 @@ def segment_cloud(
     ground: np.ndarray | None = None,
     cluster_ids: np.ndarray | None = None,
 ) -> SegmentedCloud:
-    """Run the stages up to the boxes.
+    """Run the stages of the pipeline up to the boxes.
 
     Args:
         cloud: A PointCloud, or an array (N, 3) or (N, 4) as for PointCloud.of.
-        camera: Camera of the view, None if params.view is off.
+        camera: Camera, required if params.view is enabled.
         params: Parameters of the pipeline.
         ground: (N,) bool mask of the ground points; computed if None.
         cluster_ids: (N,) ids from any clustering; computed if None.
 
     Raises:
-        InputError: params.view is on without a camera, or an array has the wrong shape or length.
+        InputError: The camera is missing, or an array has the wrong shape or length.
     """
     t0 = perf_counter()
     frame = as_point_cloud(cloud)
@@ -54,17 +53,17 @@ def segment_cloud(
     t1 = perf_counter()
     ground = segment_ground(view_cloud, params.ground) if ground is None else np.asarray(ground, bool)[indices]
     t2 = perf_counter()
-    numbers = None
+    original_ids = None
     if cluster_ids is None:
         cluster_ids = cluster_obstacles(view_cloud.xyz, ground, params.clustering)
     else:
-        cluster_ids, numbers = renumber_ids(np.asarray(cluster_ids)[indices])
+        cluster_ids, original_ids = renumber_ids(np.asarray(cluster_ids)[indices])
     t3 = perf_counter()
     boxes = fit_grounded_boxes(view_cloud.xyz, ground, cluster_ids, params.boxes)
     t4 = perf_counter()
     ms = dict(view=t1 - t0, ground=t2 - t1, clustering=t3 - t2, boxes=t4 - t3)
     return SegmentedCloud(
-        indices, view_cloud.xyz, ground, cluster_ids, boxes, numbers, ms={k: v * 1e3 for k, v in ms.items()}
+        indices, view_cloud.xyz, ground, cluster_ids, boxes, original_ids, ms={k: v * 1e3 for k, v in ms.items()}
     )
 
 
@@ -97,13 +96,13 @@ def find_candidates(
 def refine_segmented(
     segmented: SegmentedCloud, seed: SeedSource, params: PipelineParams = PipelineParams()
 ) -> Candidates:
-    """Find the candidates among the clusters of a cloud; clusters keep the ids of the cloud.
+    """Find the candidates among the clusters of a segmented cloud. Clusters keep their original ids.
 
     Raises:
-        InputError: There is no seed.
+        InputError: The seed source has no seed for this cloud.
     """
     candidates = refine_clusters(segmented.xyz, segmented.cluster_ids, segmented.boxes, seed(segmented), params)
     clusters = candidates.clusters
-    if segmented.numbers is not None:
-        clusters = segmented.numbers[clusters - 1]
+    if segmented.original_ids is not None:
+        clusters = segmented.original_ids[clusters - 1]
     return replace(candidates, clusters=clusters, ms={**segmented.ms, **candidates.ms})

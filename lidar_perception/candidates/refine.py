@@ -20,7 +20,7 @@ STAGES = ("stage1", "stage2", "final")
 
 @dataclass(frozen=True)
 class Candidates:
-    """Detections after the height filter (stage1), STM (stage2) and STM with CPA (final).
+    """Detections after each stage of the refinement.
 
     Scores are the similarity to the seed (without CPA for stage1 and stage2) or, if enabled, the
     confidence.
@@ -30,7 +30,7 @@ class Candidates:
         stage2: Detections after STM.
         final: Detections after STM with CPA.
         clusters: (K,) int64 cluster ids of the detections in `final`, ascending.
-        ms: Duration of each step.
+        ms: Duration of each step in milliseconds.
     """
 
     stage1: Detections
@@ -56,9 +56,7 @@ def refine_clusters(
     seeds: Sequence[Seed],
     params: PipelineParams = PipelineParams(),
 ) -> Candidates:
-    """Find the candidates among clusters 1..K.
-
-    The score of a cluster is the highest one over all seeds.
+    """Find the candidates among clusters 1..K. The score of a cluster is the highest over all seeds.
 
     Args:
         xyz: (N, 3) points.
@@ -69,14 +67,14 @@ def refine_clusters(
     """
     t0 = perf_counter()
     has_seed_height = np.array([select_by_height(boxes, seed.height, params.height) for seed in seeds])
-    kept_indices = np.flatnonzero(has_seed_height.any(axis=0))
-    has_seed_height = has_seed_height[:, kept_indices]
-    boxes = boxes[kept_indices]
+    indices = np.flatnonzero(has_seed_height.any(axis=0))
+    has_seed_height = has_seed_height[:, indices]
+    boxes = boxes[indices]
     floors = boxes[:, 2] - boxes[:, 5] / 2
     t1 = perf_counter()
-    templates = [seed.silhouette(params) for seed in seeds]
-    points, start = group_points(xyz, labels, kept_indices + 1)
-    images = draw_silhouettes(points, start, np.ones((len(kept_indices), 1)), floors, params)
+    templates = [seed.draw_silhouette(params) for seed in seeds]
+    points, start = group_points(xyz, labels, indices + 1)
+    images = draw_silhouettes(points, start, np.ones((len(indices), 1)), floors, params)
     stm_scores = np.array([compute_similarity(images, template, params.stm) for template in templates])
     t2 = perf_counter()
     ranges = np.hypot(boxes[:, 0], boxes[:, 1])
@@ -85,7 +83,7 @@ def refine_clusters(
     cpa_scores = stm_scores.copy()
     if len(augmented_indices):
         images = draw_silhouettes(
-            *group_points(xyz, labels, kept_indices[augmented_indices] + 1),
+            *group_points(xyz, labels, indices[augmented_indices] + 1),
             scales[augmented_indices],
             floors[augmented_indices],
             params,
@@ -98,9 +96,9 @@ def refine_clusters(
         threshold = params.confidence.threshold
         shape = compute_shape_features(points, start, boxes, params)
         for seed, *similarities in zip(seeds, stm_scores, cpa_scores):
-            # The similarity of the seed's own cluster carries no information: it is always 1.
+            # The seed's own cluster always has a similarity of 1, which carries no information.
             is_seed = find_seed_cluster(seed, points, start)
-            seed_confidence = 1.0 if seed.certain else compute_confidence(shape)
+            seed_confidence = 1.0 if seed.is_confirmed else compute_confidence(shape)
             height_difference = shape["height_m"] - seed.height
             for scores in similarities:
                 scores[:] = np.where(is_seed, seed_confidence, compute_confidence(shape, scores, height_difference))
@@ -109,13 +107,13 @@ def refine_clusters(
     )
     t4 = perf_counter()
 
-    def make_detections(scores: np.ndarray, accepted: np.ndarray) -> Detections:
-        return Detections.of(boxes[accepted], PEDESTRIAN, scores[accepted])
+    def make_detections(scores: np.ndarray, mask: np.ndarray) -> Detections:
+        return Detections.of(boxes[mask], PEDESTRIAN, scores[mask])
 
     return Candidates(
-        make_detections(stm_scores, np.ones(len(kept_indices), bool)),
+        make_detections(stm_scores, np.ones(len(indices), bool)),
         make_detections(stm_scores, stm_scores >= threshold),
         make_detections(cpa_scores, cpa_scores >= threshold),
-        kept_indices[cpa_scores >= threshold] + 1,
+        indices[cpa_scores >= threshold] + 1,
         dict(height=(t1 - t0) * 1e3, stm=(t2 - t1) * 1e3, cpa=(t3 - t2) * 1e3, confidence=(t4 - t3) * 1e3),
     )

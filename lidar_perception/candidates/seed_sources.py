@@ -1,4 +1,4 @@
-"""Sources of the seed pedestrian: labels, a click, a template, or the cloud itself."""
+"""Sources of seed pedestrians: labels, a click, a template, or the cloud itself."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from lidar_perception.candidates.seeds import MIN_POINTS, Seed, seed_from_click,
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud
 from lidar_perception.groups import group_points
 
-# Returns the seeds for a segmented cloud, one or more; the most similar one counts.
+# Returns one or more seeds for a segmented cloud; clusters are compared with the most similar one.
 SeedSource = Callable[[SegmentedCloud], tuple[Seed, ...]]
 
 
 def make_truth_source(pedestrians: np.ndarray) -> SeedSource:
-    """Make a source whose seed is the nearest pedestrian of boxes (M, 7), as in the paper."""
+    """Make a source whose seed is the nearest of the labelled pedestrians (M, 7), as in the paper."""
     return lambda segmented: (seed_from_truth(segmented.xyz, segmented.ground, pedestrians),)
 
 
@@ -29,9 +29,9 @@ def make_click_source(click: np.ndarray, params: SeedParams = SeedParams()) -> S
 
 
 def make_automatic_source(templates: Sequence[Seed], params: PipelineParams) -> SeedSource:
-    """Make a source whose seed is the cluster that is most likely a pedestrian.
+    """Make a source whose seed is the cluster with the highest confidence of being a pedestrian.
 
-    If its confidence is below params.seed.min_confidence, the templates are the seeds.
+    If this confidence is below params.seed.min_confidence, the templates are the seeds.
     """
 
     def source(segmented: SegmentedCloud) -> tuple[Seed, ...]:
@@ -42,7 +42,7 @@ def make_automatic_source(templates: Sequence[Seed], params: PipelineParams) -> 
             )
         )
         confidence[np.bincount(segmented.cluster_ids, minlength=len(segmented.boxes) + 1)[1:] < MIN_POINTS] = -1.0
-        if confidence.max(initial=-1.0) < params.seed.min_confidence:  # min_confidence may be 0
+        if confidence.max(initial=-1.0) < params.seed.min_confidence:  # -1 < 0 if there are no clusters
             return tuple(templates)
         best = int(confidence.argmax())
         return (seed_from_points(segmented.xyz[segmented.cluster_ids == best + 1], segmented.boxes[best]),)

@@ -15,9 +15,9 @@ from lidar_perception.geometry import points_in_box
 from lidar_perception.runs.files import read_text, shorten_error, write_text
 from lidar_perception.types import MAX_RANGE, InputError
 
-MIN_POINTS = 10  # fewer points have no meaningful shape; equals DBSCAN's min_samples
-DECIMALS = 4  # decimals of the coordinates (metres) in a template file
-MAX_TEMPLATE_BYTES = 10**7  # maximum size of a template, about 200,000 points
+MIN_POINTS = 10  # minimum number of points with a meaningful shape, equal to DBSCAN's min_samples
+DECIMALS = 4  # decimals of coordinates in template files, in metres
+MAX_TEMPLATE_BYTES = 10**7  # maximum size of a template file, about 200,000 points
 
 
 @dataclass(frozen=True)
@@ -27,38 +27,40 @@ class Seed:
     Attributes:
         xyz: (M, 3) float32 points in the LiDAR frame, M >= 10.
         floor: z of the ground below the pedestrian, metres.
-        height: Height of the pedestrian above the ground, metres.
-        certain: True if a person or a label confirms that it is a pedestrian.
+        height: Body height, metres.
+        is_confirmed: True if a user or a label confirms that it is a pedestrian.
     """
 
     xyz: np.ndarray
     floor: float
     height: float
-    certain: bool = False
+    is_confirmed: bool = False
 
-    def silhouette(self, params: PipelineParams = PipelineParams()) -> np.ndarray:
-        """Draw the silhouette of the seed, (80,) uint32 (see silhouette.py)."""
+    def draw_silhouette(self, params: PipelineParams = PipelineParams()) -> np.ndarray:
+        """Draw the silhouette of the seed, (80,) uint32, see silhouette.py."""
         return draw_silhouettes(
             self.xyz, np.array([0, len(self.xyz)]), np.ones((1, 1)), np.array([self.floor]), params
         )[0]
 
 
-def seed_from_points(xyz: np.ndarray, box: np.ndarray, certain: bool = False) -> Seed:
+def seed_from_points(xyz: np.ndarray, box: np.ndarray, is_confirmed: bool = False) -> Seed:
     """Make a seed from a pedestrian's points (M, 3) and its box (7,) on the ground.
 
     Raises:
         InputError: There are fewer than MIN_POINTS points.
     """
     if len(xyz) < MIN_POINTS:
-        raise InputError(f"the seed pedestrian has {len(xyz)} points; pick a nearer one (at least {MIN_POINTS})")
-    return Seed(np.ascontiguousarray(xyz, np.float32), float(box[2] - box[5] / 2), float(box[5]), certain)
+        raise InputError(
+            f"the seed pedestrian has only {len(xyz)} points, but needs at least {MIN_POINTS}; choose a nearer one"
+        )
+    return Seed(np.ascontiguousarray(xyz, np.float32), float(box[2] - box[5] / 2), float(box[5]), is_confirmed)
 
 
 def find_seed_cluster(seed: Seed, xyz: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Return a mask (K,) bool of the clusters that contain at least half of the seed's points.
 
-    Cluster k has the rows start[k]:start[k + 1] of xyz (N, 3) float32. In other frames than the
-    seed's, the mask is False everywhere.
+    Cluster k has the rows start[k]:start[k + 1] of xyz (N, 3) float32. In frames other than the
+    seed's own, the mask is all False.
     """
     row_type = np.dtype((np.void, 12))
     is_seed_point = np.isin(
@@ -70,67 +72,72 @@ def find_seed_cluster(seed: Seed, xyz: np.ndarray, start: np.ndarray) -> np.ndar
 
 
 def seed_from_truth(xyz: np.ndarray, ground: np.ndarray, pedestrians: np.ndarray) -> Seed:
-    """Make a seed from the nearest pedestrian of boxes (M, 7), as in the paper.
+    """Make a seed from the nearest of the labelled pedestrians, as in the paper.
 
-    The seed has the height of the box and the points in the box that are not ground.
+    The seed consists of the points in the box that are not ground, and has the height of the box.
+
+    Args:
+        xyz: (N, 3) points.
+        ground: (N,) bool mask of the ground points.
+        pedestrians: (M, 7) labelled boxes.
 
     Raises:
-        InputError: There is no pedestrian, or it has too few points.
+        InputError: There is no pedestrian, or the nearest one has too few points.
     """
     if len(pedestrians) == 0:
-        raise InputError("no Pedestrian in the ground truth of this frame, so no seed")
+        raise InputError("no seed, because the ground truth of this frame has no Pedestrian")
     nearest = pedestrians[np.argmin(np.hypot(pedestrians[:, 0], pedestrians[:, 1]))]
-    return seed_from_points(xyz[points_in_box(xyz, nearest) & ~ground], nearest, certain=True)
+    return seed_from_points(xyz[points_in_box(xyz, nearest) & ~ground], nearest, is_confirmed=True)
 
 
 def seed_from_click(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray, radius: float) -> Seed:
-    """Make a seed from the cluster that is nearest to click (3,).
+    """Make a seed from the cluster nearest to a clicked point.
 
     Args:
         click: (3,) point in the frame of the cloud.
         xyz: (N, 3) points.
         labels: (N,) cluster 1..K of each point, 0 for none.
         boxes: (K, 7) boxes of the clusters, snapped to the ground.
-        radius: Maximum distance, metres.
+        radius: Maximum distance to the cluster, metres.
 
     Raises:
         InputError: See find_clicked_cluster, or the cluster has too few points.
     """
     label = find_clicked_cluster(click, xyz, labels, radius)
-    return seed_from_points(xyz[labels == label], boxes[label - 1], certain=True)
+    return seed_from_points(xyz[labels == label], boxes[label - 1], is_confirmed=True)
 
 
 def find_clicked_cluster(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, radius: float) -> int:
-    """Find the cluster with the point that is nearest to click (3,) and return its label.
+    """Find the cluster nearest to a clicked point and return its label.
 
     Args:
         click: (3,) point in the frame of the cloud.
         xyz: (N, 3) points.
         labels: (N,) cluster of each point, 0 for none.
-        radius: Maximum distance, metres.
+        radius: Maximum distance to the cluster, metres.
 
     Raises:
         InputError: No cluster is within the radius, or the click is not finite.
     """
     click = np.asarray(click, np.float64)
     if not np.isfinite(click).all():
-        raise InputError("the clicked point has a coordinate that is not finite; click again")
+        raise InputError("the coordinates of the clicked point are not finite; click again")
     clustered_indices = np.flatnonzero(labels)
     if len(clustered_indices) == 0:
-        raise InputError("a point was clicked but the cloud has no clusters")
+        raise InputError("no cluster to select with the click, because the cloud has no clusters")
     with np.errstate(over="ignore"):
         distance = np.linalg.norm(xyz[clustered_indices] - click.astype(np.float32), axis=1)
     if not distance.min() <= radius:
         raise InputError(
-            f"nearest cluster is {distance.min():.1f} m from the clicked point; click within {radius:g} m of one"
+            f"the nearest cluster is {distance.min():.1f} m from the clicked point; click within {radius:g} m of it"
         )
     return int(labels[clustered_indices[distance.argmin()]])
 
 
 def save_seed(seed: Seed, path: str | Path) -> None:
-    """Write a template as JSON; it contains the points, and the silhouette as text for humans."""
-    rows = ["".join(".#"[bit] for bit in row) for row in to_pixels(seed.silhouette()).astype(int)]
-    points = [[round(float(v), DECIMALS) for v in p] for p in seed.xyz]
+    """Write a template as JSON, with the points, and the silhouette as text for human readers."""
+    rows = ["".join(".#"[bit] for bit in row) for row in to_pixels(seed.draw_silhouette()).astype(int)]
+    points = [[round(float(value), DECIMALS) for value in point] for point in seed.xyz]
     write_text(
         path,
         json.dumps(
@@ -146,15 +153,15 @@ def save_seed(seed: Seed, path: str | Path) -> None:
 
 
 def load_seeds(paths: str = "") -> tuple[Seed, ...]:
-    """Read one or more templates, given their paths separated by commas; see load_seed."""
+    """Read one or more templates from comma-separated paths, see load_seed."""
     return tuple(load_seed(path.strip()) for path in paths.split(","))
 
 
 def load_seed(path: str | Path = "") -> Seed:
-    """Read a template; an empty path stands for the shipped template, a simulated pedestrian.
+    """Read a template. An empty path selects the shipped template, a simulated pedestrian.
 
     Raises:
-        InputError: The file is not a valid template; the message names the file and the error.
+        InputError: The file is not a valid template.
     """
     shipped_file = files("lidar_perception.candidates") / "pedestrian.json"
     source = path or shipped_file
@@ -167,7 +174,7 @@ def load_seed(path: str | Path = "") -> Seed:
         if isinstance(error, InputError):
             raise
         raise InputError(
-            f"{source} is not a template ({shorten_error(error)}); make one with 'lidar-perception seed'"
+            f"{source} is not a template file ({shorten_error(error)}); create one with `lidar-perception seed`"
         ) from None
     if (
         xyz.ndim != 2
@@ -178,7 +185,7 @@ def load_seed(path: str | Path = "") -> Seed:
         or not abs(floor) <= MAX_RANGE
     ):
         raise InputError(
-            f"{source}: a template has {MIN_POINTS} points_m or more of x, y, z, and "
-            "height_m above 0; make one with 'lidar-perception seed'"
+            f"{source} is not a valid template: expected height_m above 0, and at least {MIN_POINTS} points [x, y, z] "
+            "in points_m; create one with `lidar-perception seed`"
         )
     return Seed(xyz, floor, height)

@@ -1,4 +1,4 @@
-"""Cloud segmented into ground and clusters, the input for seeds and candidates."""
+"""Clouds segmented into ground and clusters, the input for seeds and candidates."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lidar_perception.clustering.params import BoxParams
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.ground.params import ThresholdParams
 from lidar_perception.ground.threshold import fit_plane, fit_plane_by_ransac
-from lidar_perception.types import InputError, PointCloud
+from lidar_perception.types import EMPTY_CLOUD, InputError, PointCloud
 from lidar_perception.wire.params import ViewParams
 
 
@@ -20,13 +20,13 @@ class SegmentedCloud:
     """Ground, clusters and boxes of the M points of a cloud that are in view.
 
     Attributes:
-        indices: (M,) int64 rows of the points in the cloud.
+        indices: (M,) int64 indices of the points in the cloud.
         xyz: (M, 3) float32 points.
         ground: (M,) bool mask of the ground points.
         cluster_ids: (M,) int32 cluster 1..K of each point, 0 for none.
         boxes: (K, 7) float32 boxes of the clusters, extended down to the ground plane.
-        numbers: (K,) int64 ids of these clusters in the cloud; None for 1..K.
-        ms: Duration of each step.
+        original_ids: (K,) int64 ids of the clusters in the input; None if they are 1..K.
+        ms: Duration of each step in milliseconds.
     """
 
     indices: np.ndarray
@@ -34,7 +34,7 @@ class SegmentedCloud:
     ground: np.ndarray
     cluster_ids: np.ndarray
     boxes: np.ndarray
-    numbers: np.ndarray | None = None
+    original_ids: np.ndarray | None = None
     ms: dict[str, float] = field(default_factory=dict)
 
 
@@ -47,19 +47,19 @@ def fit_grounded_boxes(
 
 
 def snap_to_ground(boxes: np.ndarray, plane: np.ndarray | None) -> np.ndarray:
-    """Return boxes (K, 7) extended down to the plane below their centre (Section 3.4).
+    """Return boxes (K, 7) extended down to the plane below their centres (Section 3.4).
 
-    Boxes that already reach below the plane are not changed, nor is any box without a plane.
+    Boxes that already reach below the plane are not changed. If the plane is None, no box is.
     """
-    snapped = boxes.copy()
+    extended = boxes.copy()
     if plane is None:
-        return snapped
+        return extended
     plane_z = boxes[:, :2].astype(np.float64) @ plane[:2] + plane[2]
     top = boxes[:, 2] + boxes[:, 5] / 2
     bottom = np.minimum(boxes[:, 2] - boxes[:, 5] / 2, plane_z)
-    snapped[:, 2] = (top + bottom) / 2
-    snapped[:, 5] = top - bottom
-    return snapped
+    extended[:, 2] = (top + bottom) / 2
+    extended[:, 5] = top - bottom
+    return extended
 
 
 def fit_ground_plane(ground: np.ndarray, params: BoxParams) -> np.ndarray | None:
@@ -69,30 +69,30 @@ def fit_ground_plane(ground: np.ndarray, params: BoxParams) -> np.ndarray | None
     return fit_plane(ground)
 
 
-def diagnose_empty(usable: int, ground: np.ndarray, cluster_ids: np.ndarray | None = None) -> str | None:
-    """Return the reason, with a remedy, why a cloud has no candidates; None if none is known.
+def diagnose_empty(point_count: int, ground: np.ndarray, cluster_ids: np.ndarray | None = None) -> str | None:
+    """Return the reason why a cloud has no candidates, with a remedy, or None.
 
     Args:
-        usable: Number of finite points in the cloud.
+        point_count: Number of finite points in the cloud.
         ground: (M,) mask of the ground points among the points in view.
         cluster_ids: (M,) cluster of each point in view, 0 for none.
     """
-    if usable == 0:
-        return "the cloud is empty or has no finite point, or crop.* leaves none"
+    if point_count == 0:
+        return EMPTY_CLOUD
     if len(ground) == 0:
-        return "no point is in the camera's view, or crop.* leaves none there; check the LiDAR-to-camera transform"
+        return "no points in the camera's view; check the LiDAR-to-camera transform and crop.*"
     if not ground.any():
-        return "no ground found; is the sensor mounted at another height or angle? set ground.sensor_pose"
+        return "no ground found; set ground.sensor_pose to the sensor's actual height and tilt"
     if cluster_ids is not None and not cluster_ids.any():
-        return "no clusters; are the numbers of clustering.dbscan or clustering.euclidean right for this sensor?"
+        return "no clusters found; adapt clustering.dbscan or clustering.euclidean to this sensor"
     return None
 
 
 def crop_to_view(frame: PointCloud, camera: Camera | None, params: ViewParams) -> tuple[np.ndarray, PointCloud]:
-    """Crop a frame to the points in the camera's view, if params.enabled is True.
+    """Crop a frame to the camera's view if params.enabled is True.
 
     Returns:
-        Indices (M,) int64 of the points that are kept, and the frame with these points.
+        Indices (M,) int64 of the remaining points, and the frame with these points.
 
     Raises:
         InputError: params.enabled is True but there is no camera.
@@ -101,7 +101,7 @@ def crop_to_view(frame: PointCloud, camera: Camera | None, params: ViewParams) -
         return np.arange(len(frame)), frame
     if camera is None:
         raise InputError(
-            "view.enabled is on but there is no camera calibration; give CameraInfo "
+            "view.enabled is true but there is no camera calibration; provide CameraInfo "
             "and the LiDAR-to-camera transform, or set view.enabled to false"
         )
     indices = np.flatnonzero(camera.in_view(frame.xyz))

@@ -1,7 +1,8 @@
 """Silhouettes of clusters and their similarity: STM with CPA (paper A, Sections 3.6 and 3.7).
 
-A silhouette is (80,) uint32: 80 rows from top to bottom, and 32 columns as the bits of a word.
-Closing and dilation are a few shifts per row, and the cosine of two binary images counts bits.
+A silhouette is (80,) uint32: 80 rows from top to bottom, each with 32 columns as the bits of a
+word. Closing and dilation therefore take a few shifts per row, and the cosine similarity of two
+binary images is computed by counting bits.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from numba import njit
 
 from lidar_perception.candidates.params import CpaParams, PipelineParams, StmParams
 
-ROWS, COLUMNS = 80, 32  # the paper's window, Table 2
+ROWS, COLUMNS = 80, 32  # size of the paper's window in pixels, Table 2
 WINDOW_HEIGHT_M, WINDOW_WIDTH_M = 2.4, 1.6  # size of the metric window
 FULL_ROW = np.uint64(0xFFFFFFFF)
 ONE, LAST_COLUMN = np.uint64(1), np.uint64(31)
@@ -29,14 +30,14 @@ def draw_silhouettes(
     The steps are those of the paper, unless params.stm changes them:
 
     1. Rotate the cluster about z so that its widest direction in x-y becomes y. The direction is
-       found by PCA and oriented as seen from the sensor.
+       found by PCA and points to the left as seen from the sensor.
     2. Add the CPA copies, contracted towards the centroid in y-z.
     3. Stretch the y-z extent to the window.
-    4. Close with 3 x 3, then dilate with 3 x 3.
+    4. Apply a 3 x 3 closing and a 3 x 3 dilation.
 
     Args:
         xyz: (N, 3) float32 points, sorted by cluster.
-        start: (K + 1,); cluster k has the rows start[k]:start[k + 1], at least one.
+        start: (K + 1,); cluster k has the rows start[k]:start[k + 1], at least one row.
         scales: (K, S) float64 scales a_k of the CPA copies; 1 for the original points (see
             compute_cpa_scales).
         floors: (K,) z of the ground below each cluster, for the metric window only.
@@ -75,10 +76,11 @@ def compute_cpa_scales(ranges: np.ndarray, params: CpaParams) -> np.ndarray:
 
 
 def compute_similarity(images: np.ndarray, template: np.ndarray, params: StmParams = StmParams()) -> np.ndarray:
-    """Compute the cosine similarity (K,) of images (K, 80) and a template (80,); 0 if one is blank.
+    """Compute the cosine similarity (K,) of images (K, 80) and a template (80,); 0 if either is blank.
 
-    The images are shifted sideways by up to params.shifts columns, and the best value is returned.
-    With params.seen_only, only the rows above the lowest set row of both are compared.
+    The images are shifted horizontally by up to params.shifts columns, and the highest similarity
+    is returned. With params.seen_only, only rows down to the lowest row in which both have pixels
+    are compared.
     """
     if params.seen_only and params.window == "metric":
         rows = np.arange(ROWS)
@@ -89,23 +91,17 @@ def compute_similarity(images: np.ndarray, template: np.ndarray, params: StmPara
         images, templates = images & row_mask, template & row_mask
     else:
         templates = template[None]
-    norm = np.sqrt(count_pixels(images) * count_pixels(templates).astype(float))
-    shared = count_pixels(images & templates)
+    norms = np.sqrt(count_pixels(images) * count_pixels(templates).astype(float))
+    shared_counts = count_pixels(images & templates)
     for columns in range(1, params.shifts + 1):
         for shifted_images in (images << np.uint32(columns), images >> np.uint32(columns)):
-            shared = np.maximum(shared, count_pixels(shifted_images & templates))
-    return np.divide(shared, norm, out=np.zeros(len(images)), where=norm > 0)
+            shared_counts = np.maximum(shared_counts, count_pixels(shifted_images & templates))
+    return np.divide(shared_counts, norms, out=np.zeros(len(images)), where=norms > 0)
 
 
 def to_pixels(image: np.ndarray) -> np.ndarray:
     """Convert a silhouette (80,) uint32 to (80, 32) bool; row 0 is the top, column 0 is bit 0."""
     return (image[:, None] >> np.arange(COLUMNS, dtype=np.uint32) & 1).astype(bool)
-
-
-def from_pixels(pixels: np.ndarray) -> np.ndarray:
-    """Convert an (80, 32) bool image to (80,) uint32, the inverse of to_pixels."""
-    weights = np.uint32(1) << np.arange(COLUMNS, dtype=np.uint32)
-    return (pixels.astype(np.uint32) * weights).sum(axis=1, dtype=np.uint32)
 
 
 def count_pixels(images: np.ndarray) -> np.ndarray:
@@ -114,13 +110,13 @@ def count_pixels(images: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def _draw_silhouettes(xyz, start, scales, floors, metric, with_pca, half_angles, dilations):
+def _draw_silhouettes(xyz, start, scales, floors, is_metric, use_pca, half_angles, dilations):
     images = np.zeros((len(start) - 1, ROWS), np.uint32)
     rows = np.empty(ROWS, np.uint64)
     for k in range(len(start) - 1):
         points = xyz[start[k] : start[k + 1]]
         centre = _find_centroid(points)
-        lateral, vertical = _find_principal_axes(points, centre) if with_pca else _find_yaw_axes(points, centre)
+        lateral, vertical = _find_principal_axes(points, centre) if use_pca else _find_yaw_axes(points, centre)
         y, z = np.empty(len(points)), np.empty(len(points))
         for i in range(len(points)):
             y[i] = z[i] = 0.0
@@ -128,18 +124,18 @@ def _draw_silhouettes(xyz, start, scales, floors, metric, with_pca, half_angles,
                 y[i] += (points[i, j] - centre[j]) * lateral[j]
                 z[i] += (points[i, j] - centre[j]) * vertical[j]
         half_sizes = half_angles * np.hypot(centre[0], centre[1])
-        # The window: its left edge, its top, pixels per metre. The centroid is the origin of y and
-        # z, so a copy is a scaled cluster; because scales are at most 1, it extends no farther.
-        if metric:
+        # The window is defined by its left edge, its top edge and its pixels per metre. The centroid
+        # is the origin of y and z, so the CPA copies, whose scales are at most 1, fit in the window.
+        if is_metric:
             left = (y.min() + y.max() - WINDOW_WIDTH_M) / 2
             top = floors[k] + WINDOW_HEIGHT_M - centre[2]
-            per_y, per_z = COLUMNS / WINDOW_WIDTH_M, ROWS / WINDOW_HEIGHT_M
+            columns_per_m, rows_per_m = COLUMNS / WINDOW_WIDTH_M, ROWS / WINDOW_HEIGHT_M
         else:
             left, top = y.min() - half_sizes[0], z.max() + half_sizes[1]
-            per_y = COLUMNS / max(y.max() + half_sizes[0] - left, 1e-6)
-            per_z = ROWS / max(top - z.min() + half_sizes[1], 1e-6)
+            columns_per_m = COLUMNS / max(y.max() + half_sizes[0] - left, 1e-6)
+            rows_per_m = ROWS / max(top - z.min() + half_sizes[1], 1e-6)
         rows[:] = 0
-        _draw(y, z, scales[k], metric, half_sizes, left, top, per_y, per_z, rows)
+        _draw_points(y, z, scales[k], is_metric, half_sizes, left, top, columns_per_m, rows_per_m, rows)
         image = _erode(_dilate(rows))
         for _ in range(dilations):
             image = _dilate(image)
@@ -148,18 +144,18 @@ def _draw_silhouettes(xyz, start, scales, floors, metric, with_pca, half_angles,
 
 
 @njit(cache=True)
-def _draw(y, z, scales, metric, half_sizes, left, top, per_y, per_z, rows):
+def _draw_points(y, z, scales, is_metric, half_sizes, left, top, columns_per_m, rows_per_m, rows):
     for s in range(len(scales)):
         if s > 0 and scales[s] == 1.0:
             continue
         for i in range(len(y)):
-            first_column = int(np.floor((scales[s] * y[i] - half_sizes[0] - left) * per_y))
-            last_column = int(np.floor((scales[s] * y[i] + half_sizes[0] - left) * per_y))
-            top_row = int(np.floor((top - scales[s] * z[i] - half_sizes[1]) * per_z))
-            bottom_row = int(np.floor((top - scales[s] * z[i] + half_sizes[1]) * per_z))
-            if metric and (last_column < 0 or first_column >= COLUMNS or bottom_row < 0 or top_row >= ROWS):
+            first_column = int(np.floor((scales[s] * y[i] - half_sizes[0] - left) * columns_per_m))
+            last_column = int(np.floor((scales[s] * y[i] + half_sizes[0] - left) * columns_per_m))
+            top_row = int(np.floor((top - scales[s] * z[i] - half_sizes[1]) * rows_per_m))
+            bottom_row = int(np.floor((top - scales[s] * z[i] + half_sizes[1]) * rows_per_m))
+            if is_metric and (last_column < 0 or first_column >= COLUMNS or bottom_row < 0 or top_row >= ROWS):
                 continue
-            # No point is outside a stretched window; its far edges belong to the last pixels.
+            # All points are in a stretched window; those on its far edges belong to the last pixels.
             first_column, last_column = min(max(first_column, 0), COLUMNS - 1), min(last_column, COLUMNS - 1)
             top_row = min(top_row, ROWS - 1)
             bits = (FULL_ROW >> np.uint64(31 - last_column + first_column)) << np.uint64(first_column)
@@ -178,7 +174,7 @@ def _find_centroid(points):
 
 @njit(cache=True)
 def _find_yaw_axes(points, centre):
-    """Return two unit vectors: the widest direction in x-y (to the sensor's left), and up."""
+    """Return two unit vectors: the widest direction in x-y, pointing to the sensor's left, and the up axis."""
     xx, xy, yy = 0.0, 0.0, 0.0
     for p in points:
         dx, dy = p[0] - centre[0], p[1] - centre[1]
@@ -194,13 +190,13 @@ def _find_yaw_axes(points, centre):
 
 @njit(cache=True)
 def _find_principal_axes(points, centre):
-    """Return the principal axes with the second largest and the largest spread (left and up)."""
-    spread = np.zeros((3, 3))
+    """Return the principal axes with the second largest and the largest variance, pointing left and up."""
+    scatter = np.zeros((3, 3))
     for p in points:
         for i in range(3):
             for j in range(3):
-                spread[i, j] += (p[i] - centre[i]) * (p[j] - centre[j])
-    vectors = np.linalg.eigh(spread)[1]
+                scatter[i, j] += (p[i] - centre[i]) * (p[j] - centre[j])
+    vectors = np.linalg.eigh(scatter)[1]
     lateral, vertical = vectors[:, 1].copy(), vectors[:, 2].copy()
     if vertical[2] < 0:
         vertical = -vertical
@@ -211,7 +207,7 @@ def _find_principal_axes(points, centre):
 
 @njit(cache=True)
 def _dilate(rows):
-    """Dilate with 3 x 3; pixels outside the window are treated as not set."""
+    """Dilate an image with a 3 x 3 kernel; pixels outside the window count as not set."""
     widened_rows = (rows | (rows << ONE) | (rows >> ONE)) & FULL_ROW
     result = widened_rows.copy()
     result[1:] |= widened_rows[:-1]
@@ -221,7 +217,7 @@ def _dilate(rows):
 
 @njit(cache=True)
 def _erode(rows):
-    """Erode with 3 x 3; pixels outside the window are treated as set, so the border is kept."""
+    """Erode an image with a 3 x 3 kernel; pixels outside the window count as set, so that borders remain."""
     narrowed_rows = rows & ((rows << ONE) | ONE) & ((rows >> ONE) | (ONE << LAST_COLUMN))
     result = narrowed_rows.copy()
     result[1:] &= narrowed_rows[:-1]

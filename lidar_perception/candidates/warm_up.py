@@ -1,7 +1,7 @@
-"""Warm-up of the candidate pipeline: compiles its code, or loads it, before the first cloud.
+"""Warm-up of the candidate pipeline, which compiles or loads its code before the first cloud.
 
-A node warms up only the methods that its parameters select. Another method is compiled when the
-parameter changes.
+Nodes warm up only the methods that their parameters select. If a parameter selects another method
+later, it is compiled then.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def warm_up() -> None:
 
 
 def warm_up_ground(params: GroundParams, view: ViewParams = ViewParams()) -> None:
-    """Compile the ground segmentation and the plane fit of its diagnostics."""
+    """Compile the ground segmentation, and the plane fit for its diagnostics."""
     cloud = _make_cloud()
     _, cloud = crop_to_view(cloud, CAMERA, view)
     segment_ground(cloud, params)
@@ -62,7 +62,7 @@ def warm_up_ground(params: GroundParams, view: ViewParams = ViewParams()) -> Non
 
 
 def warm_up_clustering(params: ClusteringParams, boxes: BoxParams) -> None:
-    """Compile the clustering, including that of dense clouds, and the box fit."""
+    """Compile the clustering, including its code for dense clouds, and the box fit."""
     cloud = _make_cloud()
     ground = np.zeros(len(cloud), bool)
     ids = cluster_obstacles(cloud.xyz, ground, params)
@@ -71,7 +71,7 @@ def warm_up_clustering(params: ClusteringParams, boxes: BoxParams) -> None:
 
 
 def warm_up_candidates(params: PipelineParams, segmented: bool = False) -> None:
-    """Compile the pipeline; if `segmented`, only the stages after the clustering."""
+    """Compile the pipeline, or only the stages after the clustering if `segmented` is True."""
     person = _make_person()
     seed = seed_from_points(person, np.array([8, 0, -0.85, 1, 1, 1.7, 0]))
     params = with_values(params, {"seed.min_confidence": 0.0})
@@ -84,13 +84,13 @@ def warm_up_candidates(params: PipelineParams, segmented: bool = False) -> None:
 
 
 def _warm_up_tree(params: ClusteringParams) -> None:
-    """Compile the tree of Euclidean clustering, which is used for dense clouds only."""
+    """Compile the tree of Euclidean clustering, which is used only for dense clouds."""
     if params.method == "euclidean":
         cluster_euclidean(_make_person(), params.euclidean, -1, 0)
 
 
 def _make_person() -> np.ndarray:
-    """Return 400 random points (400, 3) float32 in the volume of a person."""
+    """Return random points (400, 3) float32 in the volume of a person."""
     rng = np.random.default_rng(0)
     return (rng.uniform(-0.5, 0.5, (400, 3)) * [0.5, 0.5, 1.7] + [8, 0, -0.8]).astype(np.float32)
 
@@ -100,7 +100,7 @@ def _make_cloud() -> PointCloud:
     rng = np.random.default_rng(0)
     ground = rng.uniform(-20, 20, (600, 3)) * [1, 1, 0.001] - [0, 0, 1.7]
     person = _make_person()
-    dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 2, 0]  # triggers DBSCAN by cells
-    at_band_limit = rng.uniform(-0.1, 0.1, (200, 3)) + [15, 0, 0]  # points on both sides of a band limit
-    xyz = np.concatenate([ground, person, person + [12, 0, 0], dense, at_band_limit])
+    dense_object = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 2, 0]  # DBSCAN has a separate code path for it
+    split_object = rng.uniform(-0.1, 0.1, (200, 3)) + [15, 0, 0]  # two range bands of DBSCAN meet at 15 m
+    xyz = np.concatenate([ground, person, person + [12, 0, 0], dense_object, split_object])
     return PointCloud(xyz.astype(np.float32))

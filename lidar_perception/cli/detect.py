@@ -191,7 +191,8 @@ def detect(
     run = Run(recording, out, header, count)
     drawer = FrameDrawer(run, color)
     writer_factories: list[Any] = [
-        partial(Bag, clouds=clouds, tracked=track) if name == "mcap" else WRITERS[name] for name in format_names
+        partial(Bag, with_clouds=clouds, with_tracks=track) if name == "mcap" else WRITERS[name]
+        for name in format_names
     ]
     writer_factories += [partial(PictureWriter, drawer=drawer)] if png else []
     writer_factories += [partial(VideoWriter, drawer=drawer, path=video)] if video else []

@@ -19,7 +19,7 @@ from lidar_perception.candidates.configurations import CONFIGURATIONS, PAPER
 from lidar_perception.cli.command import Choice, HelpfulOption
 from lidar_perception.cli.parameter_files import Fields, read_parameters
 from lidar_perception.detectors.contract import FUSED
-from lidar_perception.detectors.open import DetectorChoice, default_params
+from lidar_perception.detectors.open import DetectorChoice, make_default_params
 from lidar_perception.detectors.params import RANGE_CHOICES
 from lidar_perception.nodes import NODES
 from lidar_perception.nodes.node_parameters import find_node_parameters
@@ -265,7 +265,7 @@ def make_detector_algorithm(weights: str | Path, in_nodes: bool = False) -> Algo
     Raises:
         InputError: the detector is unknown.
     """
-    params = default_params(weights)
+    params = make_default_params(weights)
     name = str(weights)
     node = next((f"{f.name}_detector" for f in fields(params) if f"{f.name}_detector" in NODES), name)
     param_fields = collect_fields(params)
@@ -378,7 +378,7 @@ def make_detector_choice(
         params: default parameters of a detector that open_detector does not support.
     """
     if values:
-        apply_values(default_params(weights) if params is None else params, values)
+        apply_values(make_default_params(weights) if params is None else params, values)
     return DetectorChoice(str(weights), range, device, dict(values))
 
 

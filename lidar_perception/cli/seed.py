@@ -69,7 +69,7 @@ def seed(
     )
     (template,) = source(segmented)
     save_seed(template, out)
-    for row in to_pixels(template.silhouette(params))[::2]:
+    for row in to_pixels(template.draw_silhouette(params))[::2]:
         console.print("".join(".#"[bit] for bit in row.astype(int)))
     console.print(f"{out}: frame {frame.name}, height {template.height:.2f} m")
 

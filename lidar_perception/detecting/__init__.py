@@ -1,1 +1,1 @@
-"""Detection in a whole recording, with results as files and as pictures."""
+"""Detection in all frames of a recording, with results as files, pictures and videos."""

@@ -1,4 +1,4 @@
-"""Results as a rosbag2 bag with the topics of the nodes."""
+"""Output of results to a rosbag2 bag with the topics of the nodes."""
 
 from __future__ import annotations
 
@@ -21,26 +21,29 @@ from msg_utils.markers import MarkerRow, list_marker_keys
 
 
 class Bag:
-    """Writes the bag bag/ with the results of a run.
+    """Output format that writes the results of a run to the bag bag/.
 
-    It has detections, the labels, camera and odometry that the recording contains, and optionally
-    tracks and clouds. Detections and tracks are MarkerArray and Detection3DArray messages on the
-    topics of the nodes. All messages have the stamp of their cloud.
+    The bag contains detections, optionally tracks and clouds, and the recording's labels, camera
+    and odometry. Detections and tracks are MarkerArray and Detection3DArray messages on the topics
+    of the nodes. All messages have the stamp of their cloud.
+
+    Args:
+        with_clouds: True to write the clouds.
+        with_tracks: True to write tracks.
     """
 
-    def __init__(self, run: Run, clouds: bool, tracked: bool) -> None:
-        self.run, self.clouds = run, clouds
-        self.needs_scans = clouds
+    def __init__(self, run: Run, with_clouds: bool, with_tracks: bool) -> None:
+        self.run, self.needs_scans = run, with_clouds
         self.path = run.out / "bag"
-        self.found = f"/{run.header['detector']}_detector{DETECTIONS}"
-        self.tracks = f"/tracker{TRACKS}" if tracked else None
+        self.detections_topic = f"/{run.header['detector']}_detector{DETECTIONS}"
+        self.tracks_topic = f"/tracker{TRACKS}" if with_tracks else None
         self.bag = BagWriter(self.path, force=True)
-        self._shown: dict[str, Any] = {}
+        self._marker_keys: dict[str, Any] = {}  # topic -> keys of the markers in its last message
 
     def __enter__(self) -> Self:
         self.bag.__enter__()
-        self.writer = FrameWriter(self.bag, clouds=self.clouds)
-        for topic in filter(None, (self.found, self.tracks)):
+        self.writer = FrameWriter(self.bag, clouds=self.needs_scans)
+        for topic in filter(None, (self.detections_topic, self.tracks_topic)):
             self.bag.add_topic(topic, MARKERS)
             self.bag.add_topic(f"{topic}_3d", DETECTIONS_3D)
         return self
@@ -51,25 +54,26 @@ class Bag:
     def add(self, result: FrameResult) -> None:
         """Write a frame, or list it as skipped if a bag cannot represent it."""
         frame = result.frame
-        if not self.clouds:  # only the frame_id of the cloud is needed
-            empty = PointCloud(np.zeros((0, 3), np.float32), frame_id=result.frame_id)
-            frame = replace(frame, load=lambda: empty)
+        if not self.needs_scans:  # only the frame_id of the cloud is used
+            empty_cloud = PointCloud(np.zeros((0, 3), np.float32), frame_id=result.frame_id)
+            frame = replace(frame, load=lambda: empty_cloud)
         try:
             content = self.writer.read(frame)
         except InputError:
-            try:  # again without labels
+            try:  # without the labels, which may be the reason for the error
                 content = self.writer.read(replace(frame, truth=return_none))
             except InputError as error:
                 self.run.skipped.append(f"not in {self.path}: {error}")
                 return
         header, stamp_ns = content.header, content.stamp_ns
-        self._write(
-            self.found, stamp_ns, header, make_detection_rows(result.detections, self._shown.get(self.found, ()))
+        previous_keys = self._marker_keys.get(self.detections_topic, ())
+        self._write_markers(
+            self.detections_topic, stamp_ns, header, make_detection_rows(result.detections, previous_keys)
         )
-        self._write_3d(self.found, stamp_ns, header, result.detections)
-        if self.tracks is not None and (tracks := result.tracks) is not None:
-            self._write(
-                self.tracks,
+        self._write_3d(self.detections_topic, stamp_ns, header, result.detections)
+        if self.tracks_topic is not None and (tracks := result.tracks) is not None:
+            self._write_markers(
+                self.tracks_topic,
                 stamp_ns,
                 header,
                 make_track_rows(
@@ -78,11 +82,11 @@ class Bag:
                     tracks.velocities,
                     tracks.moving,
                     result.trails,
-                    previous=self._shown.get(self.tracks, ()),
+                    previous=self._marker_keys.get(self.tracks_topic, ()),
                 ),
             )
             self._write_3d(
-                self.tracks,
+                self.tracks_topic,
                 stamp_ns,
                 header,
                 tracks.detections,
@@ -91,8 +95,8 @@ class Bag:
             )
         self.writer.write(content)
 
-    def _write(self, topic: str, stamp_ns: int, header: Any, rows: list[MarkerRow]) -> None:
-        self._shown[topic] = list_marker_keys(rows)
+    def _write_markers(self, topic: str, stamp_ns: int, header: Any, rows: list[MarkerRow]) -> None:
+        self._marker_keys[topic] = list_marker_keys(rows)
         self.bag.write(topic, stamp_ns, encode_markers(rows, header))
 
     def _write_3d(self, topic: str, stamp_ns: int, header: Any, detections: Detections, **options: Any) -> None:

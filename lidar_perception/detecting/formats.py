@@ -1,4 +1,4 @@
-"""Output formats: one class per format, which receives the frames in chronological order."""
+"""Output formats of detect. Each class writes one format and receives the results in chronological order."""
 
 from __future__ import annotations
 
@@ -42,8 +42,7 @@ COLUMNS = (
 UNITS = {
     "box": "x y z of the centre, length, width, height in metres, yaw in radians counter-clockwise "
     "from x, in the LiDAR frame of the cloud: x forward, y left, z up",
-    "velocity": "metres a second over ground along x and y of the LiDAR frame; relative to the "
-    "sensor where ego is none",
+    "velocity": "metres per second over ground along x and y of the LiDAR frame; relative to the sensor if ego is none",
     "score": "0..1",
     "stamp_ns": "nanoseconds",
     "ms": "milliseconds of the detector",
@@ -58,9 +57,9 @@ class Run:
         recording: input data.
         out: output folder.
         header: JSON object, see run.make_header.
-        count: number of frames to write.
+        count: number of frames to process.
         skipped: one line for each frame that could not be read or written.
-        remarks: notes on the results, grouped by their text without numbers.
+        remarks: notes for the user; keys are their texts with numbers masked.
     """
 
     recording: Recording
@@ -71,18 +70,18 @@ class Run:
     remarks: dict[str, dict[str, None]] = field(default_factory=dict)
 
     def add_remark(self, remark: str) -> None:
-        """Add a remark unless it was added before."""
+        """Add a remark if it is new."""
         self.remarks.setdefault(mask_numbers(remark), {})[remark] = None
 
 
 class Format(Protocol):
-    """Context manager that receives all results in chronological order.
+    """Context manager that writes results in one format.
 
-    It raises InputError if results cannot be written.
+    It receives the results in chronological order, and raises InputError if they cannot be written.
 
     Attributes:
-        path: file or folder of the results, complete on exit from the context.
-        needs_scans: True if the format needs the points of the clouds.
+        path: output file or folder, complete when the context is left.
+        needs_scans: True if the format uses the points of the clouds.
     """
 
     path: Path
@@ -99,7 +98,7 @@ class Format(Protocol):
 
 
 class BufferedFormat:
-    """Base class of formats that write everything at the end, unless there was an error."""
+    """Base class of formats that write all results at the end, unless there was an error."""
 
     needs_scans = False
 
@@ -114,15 +113,15 @@ class BufferedFormat:
             self.finish()
 
     def finish(self) -> None:
-        """Write the file or files."""
+        """Write the output files."""
 
 
 class Kitti(BufferedFormat):
     """Result files in the formats of the KITTI benchmarks.
 
-    Detections are written as for the object benchmark, kitti/FRAME.txt, tracks as for the tracking
-    benchmark, kitti/SEQUENCE.txt. Drives without a name are numbered 0000, 0001, ..., and their
-    frames are counted from 0.
+    Detections are written in the format of the object benchmark, kitti/FRAME.txt, and tracks in the
+    format of the tracking benchmark, kitti/SEQUENCE.txt. Drives without a name are numbered 0000,
+    0001, ..., and their frames are numbered from 0.
     """
 
     def __init__(self, run: Run) -> None:
@@ -132,13 +131,13 @@ class Kitti(BufferedFormat):
         self.cameras: dict[str, Calibration] = {}
 
     def add(self, result: FrameResult) -> None:
-        """Write the file of a frame, or with tracking, keep its tracks for the file of the drive."""
+        """Write the detections of a frame, or keep its tracks for the file of the drive."""
         frame = result.frame
-        calibration, nominal = choose_calibration(frame)
-        if nominal:
+        calibration, is_nominal = choose_calibration(frame)
+        if is_nominal:
             self.run.add_remark(
-                "there is no camera calibration: kitti/ is in the frame of a "
-                "nominal camera, level and 0.27 m ahead of the LiDAR"
+                "no camera calibration: boxes in kitti/ are relative to a nominal camera, level and 0.27 m ahead of "
+                "the LiDAR"
             )
         if result.tracks is None:
             write_results(self.path / f"{frame.name}.txt", result.objects, calibration)
@@ -160,14 +159,14 @@ class Kitti(BufferedFormat):
 
 
 class Json(BufferedFormat):
-    """One JSON document, detections.json: a header, then one frame per line."""
+    """One JSON file, detections.json: a header, followed by one frame per line."""
 
     def __init__(self, run: Run) -> None:
         super().__init__(run, run.out / "detections.json")
         self.lines: list[str] = []
 
     def add(self, result: FrameResult) -> None:
-        """Keep the line of a frame."""
+        """Format the line of a frame."""
         frame = result.frame
         self.lines.append(
             json.dumps(
@@ -186,11 +185,11 @@ class Json(BufferedFormat):
         )
 
     def finish(self) -> None:
-        head = json.dumps(
+        header = json.dumps(
             {"format": "lidar_perception detections", "units": UNITS, **self.run.header, "skipped": self.run.skipped},
             indent=1,
         )
-        write_text(self.path, f'{head[:-2]},\n "frames": [\n' + ",\n".join(self.lines) + "\n]}")
+        write_text(self.path, f'{header[:-2]},\n "frames": [\n' + ",\n".join(self.lines) + "\n]}")
 
 
 class Csv(BufferedFormat):
@@ -203,7 +202,7 @@ class Csv(BufferedFormat):
         self.table.writerow(COLUMNS)
 
     def add(self, result: FrameResult) -> None:
-        """Keep the rows of a frame."""
+        """Format the rows of a frame."""
         frame = result.frame
         for row in make_rows(result):
             self.table.writerow(
@@ -226,9 +225,9 @@ class Csv(BufferedFormat):
 
 
 class OpenLabel(BufferedFormat):
-    """ASAM OpenLABEL files, openlabel/SEQUENCE.json, for `convert` and `label`.
+    """ASAM OpenLABEL files, openlabel/SEQUENCE.json, for the commands `convert` and `label`.
 
-    A recording without sequences has one file, 0000.json. The velocity of a track is an attribute
+    Recordings without sequences have one file, 0000.json. The velocity of a track is an attribute
     of its cuboid.
     """
 
@@ -259,15 +258,15 @@ FORMATS: Mapping[str, type] = {"kitti": Kitti, "json": Json, "csv": Csv, "openla
 
 
 def mask_numbers(line: str) -> str:
-    """Replace the numbers in a line by #, to group lines of different frames."""
+    """Replace the numbers in a line by #, so that lines of different frames can be grouped."""
     return re.sub(r"\d[\d.]*", "#", line)
 
 
 def make_rows(result: FrameResult) -> list[dict[str, Any]]:
     """Return the objects of a frame as JSON objects.
 
-    They have id and velocity (both None without tracks), class, score, and the values of the box
-    with the names in BOX.
+    Their keys are id and velocity (both None without tracks), class, score, and the box values in
+    BOX.
     """
     objects, tracks = result.objects, result.tracks
     ids = repeat(None) if tracks is None else tracks.ids.tolist()

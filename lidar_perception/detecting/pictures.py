@@ -1,4 +1,4 @@
-"""Results as pictures and as a video."""
+"""Output of results as pictures and as a video."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from lidar_perception.detecting.results import FrameResult
 from lidar_perception.rendering.files import VideoFile, open_video, read_png_note, write_png
 from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
 
-LAST_PICTURE_S = 0.1  # duration of the last picture of a video
-MIN_PICTURE_S, MAX_PICTURE_S = 0.02, 0.5  # duration of the other pictures
-MIN_MOVING = 0.5  # speeds are shown for tracks with at least this probability of motion
-MIN_DATE_NS = 10**18  # stamps from September 2001 on are dates; smaller ones are relative times
+LAST_FRAME_S = 0.1  # duration of a video's last frame
+MIN_FRAME_S, MAX_FRAME_S = 0.02, 0.5  # limits for the duration of the other frames
+MIN_MOVING = 0.5  # minimum probability of motion to show the speed of a track
+MIN_DATE_NS = 10**18  # stamps from September 2001 on are dates, smaller ones are relative times
 
 
 class FrameDrawer:
-    """Draws results; all pictures of a run show the same area.
+    """Renderer of results as pictures, which show the same area in all frames of a run.
 
     Args:
-        color: value that determines the colours of the points, "height" or "intensity".
+        color: quantity that determines the colours of the points, "height" or "intensity".
         size: width and height in pixels.
     """
 
@@ -32,10 +32,10 @@ class FrameDrawer:
         self.run, self.color, self.size = run, color, size
         self.stage: Stage | None = None
         self._first_ns = 0
-        self._drawn: tuple[str, np.ndarray] | None = None
+        self._last_picture: tuple[str, np.ndarray] | None = None  # name of the frame and picture
 
     def get_stage(self, result: FrameResult) -> Stage:
-        """Return the stage of the run, which is created from the first result."""
+        """Return the stage of the run; create it from the first result."""
         if self.stage is None:
             self._first_ns = result.frame.stamp_ns
             self.stage = Stage.of(
@@ -54,28 +54,28 @@ class FrameDrawer:
             InputError: the scan cannot be read.
         """
         frame = result.frame
-        if self._drawn is None or self._drawn[0] != frame.name:
+        if self._last_picture is None or self._last_picture[0] != frame.name:
             truth = frame.truth()
             labels = np.zeros((0, 7)) if truth is None else truth.boxes
-            image = draw_frame(
+            picture = draw_frame(
                 self.get_stage(result),
                 frame.load(),
-                make_labelled_boxes(result),
+                make_annotated_boxes(result),
                 labels,
-                self.title(result),
-                self.time(frame.stamp_ns),
+                self.make_title(result),
+                self.format_time(frame.stamp_ns),
             )
-            self._drawn = frame.name, image
-        return self._drawn[1]
+            self._last_picture = frame.name, picture
+        return self._last_picture[1]
 
-    def title(self, result: FrameResult) -> str:
-        """Return the title of a picture, with recording, frame and detector."""
+    def make_title(self, result: FrameResult) -> str:
+        """Return the title of a picture: recording, frame and detector."""
         frame = result.frame
         name = f"#{frame.index}" if frame.name.startswith(str(frame.stamp_ns)) else frame.name
         path = self.run.recording.path
         return "  ".join([*[path.name] * (path.stem != name), name, self.run.header["detector"]])
 
-    def time(self, stamp_ns: int) -> str:
+    def format_time(self, stamp_ns: int) -> str:
         """Format a stamp as a date, or as seconds since the first frame if it is not a date."""
         if self.run.recording.has_times and stamp_ns >= MIN_DATE_NS:
             date = datetime.fromtimestamp(stamp_ns // 10**9, UTC)
@@ -83,8 +83,8 @@ class FrameDrawer:
         return f"{(stamp_ns - self._first_ns) / 1e9:.1f} s"
 
 
-def make_labelled_boxes(result: FrameResult) -> Boxes:
-    """Return the boxes of a result with their texts: id and speed of tracks, otherwise the score."""
+def make_annotated_boxes(result: FrameResult) -> Boxes:
+    """Return the boxes of a result with texts: id and speed of tracks, or the score of detections."""
     objects, tracks = result.objects, result.tracks
     if tracks is None:
         return Boxes(objects.boxes, objects.class_ids, [f"{score:.2f}" for score in objects.scores])
@@ -98,7 +98,7 @@ def make_labelled_boxes(result: FrameResult) -> Boxes:
 
 
 class PictureWriter:
-    """Writes a picture of every frame, png/FRAME.png. Pictures of an earlier run are kept."""
+    """Output format that writes a picture of each frame, png/FRAME.png. Existing pictures are kept."""
 
     needs_scans = True
 
@@ -112,7 +112,7 @@ class PictureWriter:
         pass
 
     def add(self, result: FrameResult) -> None:
-        """Draw a frame and write its picture."""
+        """Draw a frame and write the picture."""
         path = self.path / f"{result.frame.name}.png"
         stage = repr(self.drawer.get_stage(result))
         if read_png_note(path) != stage:
@@ -120,31 +120,31 @@ class PictureWriter:
 
 
 class VideoWriter:
-    """Writes a video of all frames with the timing of the recording."""
+    """Output format that writes a video of all frames with the timing of the recording."""
 
     needs_scans = True
 
     def __init__(self, run: Run, drawer: FrameDrawer, path: Path) -> None:
         self.drawer, self.path = drawer, path
-        self._writing: AbstractContextManager[VideoFile] = open_video(path, drawer.size)
-        self._last: tuple[int, np.ndarray] | None = None  # stamp and picture
+        self._video_context: AbstractContextManager[VideoFile] = open_video(path, drawer.size)
+        self._pending: tuple[int, np.ndarray] | None = None  # stamp and picture of the last frame
 
     def __enter__(self) -> Self:
-        self.video_file = self._writing.__enter__()
+        self.video_file = self._video_context.__enter__()
         return self
 
     def add(self, result: FrameResult) -> None:
         """Draw a frame and write the previous one, whose duration is now known."""
         picture, stamp_ns = self.drawer(result), result.frame.stamp_ns
-        if self._last is not None:
+        if self._pending is not None:
             self.video_file.add(
-                self._last[1], float(np.clip((stamp_ns - self._last[0]) / 1e9, MIN_PICTURE_S, MAX_PICTURE_S))
+                self._pending[1], float(np.clip((stamp_ns - self._pending[0]) / 1e9, MIN_FRAME_S, MAX_FRAME_S))
             )
-        self._last = stamp_ns, picture
+        self._pending = stamp_ns, picture
 
     def __exit__(self, *error: Any) -> None:
         try:
-            if error[0] is None and self._last is not None:
-                self.video_file.add(self._last[1], LAST_PICTURE_S)
+            if error[0] is None and self._pending is not None:
+                self.video_file.add(self._pending[1], LAST_FRAME_S)
         finally:
-            self._writing.__exit__(*error)
+            self._video_context.__exit__(*error)

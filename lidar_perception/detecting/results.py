@@ -1,4 +1,4 @@
-"""Results of single frames: JSON records for a journal, and FrameResults made from them."""
+"""Results of single frames: JSON records for a journal, and FrameResults made from these records."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lidar_perception.tracking.state import Tracks
 from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import CLASSES, Detections, InputError, find_class_ids
 
-TRAIL_S = 2.0  # duration of the path of a track, as in the nodes
+TRAIL_S = 2.0  # duration of the trail of a track, as in the nodes
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,13 @@ class FrameResult:
     """The result of one frame.
 
     Attributes:
-        frame: the frame of the recording.
+        frame: frame of the recording.
         detections: detections that reach the threshold of their class.
         frame_id: coordinate frame of the cloud.
         ms: duration of detection in milliseconds.
         problem: problem reported by the detector, or None.
-        tracks: None without tracking.
-        drive: name of the drive of the tracks.
+        tracks: tracks, or None without tracking.
+        drive: name of the drive that the tracks belong to.
         trails: recent positions (N, 3) of each track, oldest first.
         tracking_problem: problem reported by the tracker, or None.
     """
@@ -53,34 +53,34 @@ class FrameResult:
         return self.detections if self.tracks is None else self.tracks.detections
 
 
-def measure_records(open_: Callable[[], Detector], recording: Recording) -> Callable[[Frame], str]:
+def start_detection(open_detector: Callable[[], Detector], recording: Recording) -> Callable[[Frame], str]:
     """Return a function that runs the detector on a frame and returns the record as a JSON string.
 
-    partial(measure_records, open_) is a StartMeasurement of scoring.run.
+    partial(start_detection, open_detector) is a StartMeasurement of scoring.run.
 
     Args:
-        open_: opens the detector.
+        open_detector: opens the detector.
     """
-    detector = open_()
+    detector = open_detector()
 
     def measure(frame: Frame) -> str:
         scan = frame.load()
         begin = perf_counter()
-        output = detector(scan)
+        result = detector(scan)
         ms = (perf_counter() - begin) * 1e3
-        objects = output.detections
-        if not (np.isfinite(objects.boxes).all() and np.isfinite(objects.scores).all()):
-            raise InputError(f"{frame.name}: the detector returned numbers that are not finite; check its weights")
+        detections = result.detections
+        if not (np.isfinite(detections.boxes).all() and np.isfinite(detections.scores).all()):
+            raise InputError(f"{frame.name}: the detector returned values that are not finite; check its weights")
         return json.dumps(
             {
                 "frame": frame.name,
                 "frame_id": scan.frame_id,
                 "ms": round(ms, 3),
-                "problem": output.problem,
-                "classes": [CLASSES[i] for i in objects.class_ids],
-                "boxes": to_short_floats(objects.boxes),
-                "scores": to_short_floats(objects.scores),
-                "sources": {name: to_short_floats(p) for name, p in objects.sources.items()},
+                "problem": result.problem,
+                "classes": [CLASSES[i] for i in detections.class_ids],
+                "boxes": to_short_floats(detections.boxes),
+                "scores": to_short_floats(detections.scores),
+                "sources": {name: to_short_floats(p) for name, p in detections.sources.items()},
             }
         )
 
@@ -88,7 +88,7 @@ def measure_records(open_: Callable[[], Detector], recording: Recording) -> Call
 
 
 def read_detections(record: Mapping[str, Any]) -> Detections:
-    """Restore the detections of a record without rounding errors."""
+    """Read the detections of a record; the float32 values are restored exactly."""
     detections = Detections.of(record["boxes"], find_class_ids(record["classes"]), record["scores"])
     return replace(
         detections,
@@ -97,7 +97,7 @@ def read_detections(record: Mapping[str, Any]) -> Detections:
 
 
 def to_short_floats(values: np.ndarray) -> Any:
-    """Convert an array to nested lists, with the fewest digits that give the same float32.
+    """Convert an array to nested lists of numbers with the fewest digits that restore the same float32.
 
     NaN becomes None.
     """
@@ -110,7 +110,7 @@ def to_short_floats(values: np.ndarray) -> Any:
 def with_optional_parts(frame: Frame, report: Callable[[str], None]) -> Frame:
     """Return a frame whose labels, calibration and pose are None if they cannot be read.
 
-    The scan is read once.
+    The scan is read only once.
 
     Args:
         report: called with the reason for each part that cannot be read.
@@ -131,27 +131,27 @@ def with_optional_parts(frame: Frame, report: Callable[[str], None]) -> Frame:
     )
 
 
-def make_results(
+def start_results(
     read_record: Callable[[str], Mapping[str, Any]],
     min_scores: Mapping[str, float],
     make_tracker: Callable[[Recording], DriveTracker] | None,
     report: Callable[[str], None],
-    scans: bool,
+    needs_scans: bool,
     recording: Recording,
 ) -> Callable[[Frame], FrameResult]:
     """Return a function that makes the FrameResult of a frame from its record.
 
-    Frames must be processed in chronological order, in one process. partial() with all arguments
-    except the last one gives a StartMeasurement of scoring.run.
+    Frames must be processed in chronological order, in one process. A partial() with all arguments
+    except the last one is a StartMeasurement of scoring.run.
 
     Args:
         read_record: returns the record of a frame by its name.
         min_scores: threshold of each class.
-        make_tracker: returns the tracker for a recording, which also uses detections below the
+        make_tracker: returns a tracker for a recording, which also uses detections below the
             thresholds; None: no tracks.
         report: see with_optional_parts.
-        scans: also read the scans; frames whose scan cannot be read are skipped.
-        recording: the recording of the frames.
+        needs_scans: True to also read the scans and skip frames whose scan cannot be read.
+        recording: recording that contains the frames.
     """
     thresholds = np.array([min_scores.get(name, 0.0) for name in CLASSES], np.float32)
     tracker = None if make_tracker is None else make_tracker(recording)
@@ -162,7 +162,7 @@ def make_results(
         if (reason := record.get("skipped")) is not None:
             raise InputError(reason)
         frame, detections = with_optional_parts(frame, report), read_detections(record)
-        if scans:
+        if needs_scans:
             frame.load()
         result = FrameResult(
             frame,

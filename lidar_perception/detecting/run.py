@@ -18,7 +18,7 @@ import numpy as np
 from lidar_perception import __version__
 from lidar_perception.data.frame import Recording
 from lidar_perception.detecting.formats import Format, Run, mask_numbers
-from lidar_perception.detecting.results import FrameResult, make_results, measure_records
+from lidar_perception.detecting.results import FrameResult, start_detection, start_results
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.open import ConfigurableDetector, resolve_weights
 from lidar_perception.param_fields import flatten
@@ -28,21 +28,21 @@ from lidar_perception.tracking.drive_tracker import DriveTracker
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.types import CLASSES
 
-# Output files of a run, without the journal and the bag, which is replaced as a whole.
+# Output files of a run, except the journal, and the bag, which is always replaced.
 OUTPUT_PATTERNS = ("kitti/**/*.txt", "detections.json", "detections.csv", "openlabel/*.json", "png/**/*.png")
 
 
 @dataclass
 class Summary:
-    """Statistics of the results of a run; also forwards the results to the output formats.
+    """Statistics of the results of a run, which also passes the results on to the output formats.
 
     Attributes:
-        formats: the output formats.
+        formats: output formats.
         frames: number of results.
         boxes: number of boxes of each class.
         tracks: ids of the tracks.
         ms: duration of each detection in milliseconds.
-        problems: number of frames with each problem of the detector or tracker.
+        problems: number of frames with each problem reported by the detector or tracker.
         skipped: one line for each frame without a result.
     """
 
@@ -53,7 +53,7 @@ class Summary:
     ms: list[float] = field(default_factory=list)
     problems: Counter[str] = field(default_factory=Counter)
     skipped: list[str] = field(default_factory=list)
-    _first: dict[str, str] = field(default_factory=dict)  # problem by its text without numbers
+    _first_problems: dict[str, str] = field(default_factory=dict)  # text with masked numbers -> first such problem
 
     def update(self, result: FrameResult) -> None:
         """Count a frame and write it in all formats."""
@@ -62,7 +62,7 @@ class Summary:
         self.tracks.update([] if result.tracks is None else result.tracks.ids.tolist())
         self.ms.append(result.ms)
         for problem in filter(None, (result.problem, result.tracking_problem)):
-            self.problems[self._first.setdefault(mask_numbers(problem), problem)] += 1
+            self.problems[self._first_problems.setdefault(mask_numbers(problem), problem)] += 1
         for output in self.formats:
             output.add(result)
 
@@ -72,7 +72,7 @@ class Summary:
         return [output.path for output in self.formats if output.path.exists()]
 
     def compute(self) -> dict[str, Any]:
-        """Return the statistics as a JSON object; ms is the median, None without frames."""
+        """Return the statistics as a JSON object, where ms is the median, or None without frames."""
         return {
             "frames": self.frames,
             "boxes": dict(self.boxes),
@@ -92,9 +92,9 @@ def make_header(
     ego: str | None = None,
     **settings: Any,
 ) -> dict[str, Any]:
-    """Return a JSON object with everything that determines the results of a run.
+    """Return a JSON object with everything that affects the results of a run.
 
-    Two runs with the same header have the same results.
+    Runs with the same header have the same results.
 
     Args:
         weights: file or name of the weights.
@@ -125,7 +125,7 @@ def make_header(
 
 def detect(
     run: Run,
-    open_: Callable[[], Detector],
+    open_detector: Callable[[], Detector],
     formats: Sequence[Callable[[Run], Format]],
     *,
     tracking: TrackingParams | None = None,
@@ -137,30 +137,30 @@ def detect(
     """Run a detector on the first run.count frames of a recording and write the results.
 
     Detections are written if they reach the min_scores of run.header. With tracking, the tracks of
-    all detections are written instead. Each finished frame is saved in run.out immediately. An
-    interrupted run with the same header is resumed, and further formats can be added without
-    detecting again. Except for durations, results do not depend on resuming, jobs or dask, see
-    scoring.run.measure_frames.
+    all detections are written instead. Each finished frame is saved in run.out immediately, so that
+    an interrupted run with the same header is resumed, and more formats can be written later
+    without running the detector again. Except for durations, results do not depend on resuming,
+    jobs or dask, see scoring.run.measure_frames.
 
     Args:
-        open_: opens the detector.
+        open_detector: opens the detector.
         formats: constructors of the output formats.
         tracking: parameters of the tracker; None: no tracks.
         ego: source of the sensor poses for tracking.
         jobs: number of parallel processes.
         dask: address of a Dask scheduler; None: run on this machine.
-        force: start over if run.out has the results of another run.
+        force: True to start over if run.out contains the results of a different run.
 
     Raises:
-        InputError: run.out has the results of another run, results cannot be written, or a process
-            or the cluster fails.
+        InputError: run.out contains the results of a different run, results cannot be written, or a
+            process or the cluster fails.
     """
     recording = run.recording
     tracker = None if tracking is None else partial(DriveTracker, params=tracking, ego=ego)
     with open_journal(run.out, run.header, force=force, list_files=list_outputs) as journal:
         names = [frame.name for frame in islice(recording, run.count)]
         fill_journal(
-            journal, recording, partial(measure_records, open_), names, jobs=jobs, dask=dask, title="detecting"
+            journal, recording, partial(start_detection, open_detector), names, jobs=jobs, dask=dask, title="detecting"
         )
         journal.sort(names)
 
@@ -169,8 +169,8 @@ def detect(
 
         with ExitStack() as stack:
             open_formats = [stack.enter_context(make(run)) for make in formats]
-            start_results = partial(
-                make_results,
+            start = partial(
+                start_results,
                 read_record,
                 run.header["min_scores"],
                 tracker,
@@ -178,7 +178,7 @@ def detect(
                 any(output.needs_scans for output in open_formats),
             )
             summary = Summary(open_formats, skipped=run.skipped)
-            fill_report(summary, recording, start_results, limit=run.count, title="writing")
+            fill_report(summary, recording, start, limit=run.count, title="writing")
     return summary
 
 

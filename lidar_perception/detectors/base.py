@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from lidar_perception.detectors.contract import Cloud, DetectionResult, accept, join_problems
+from lidar_perception.detectors.contract import Cloud, DetectionResult, check_input, join_problems
 from lidar_perception.detectors.params import NetworkParams, ScoreParams
 from lidar_perception.detectors.trained_network import TrainedNetwork
 from lidar_perception.ground.params import SensorPoseParams, set_sensor_height
@@ -17,10 +17,10 @@ from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
 
 
 class NetworkDetector:
-    """Base class of the detectors.
+    """Base class of detectors with neural networks.
 
     Attributes:
-        params: dataclass with the groups input, crop, ground, ... and `group`; see with_params.
+        params: parameters of the detector's node, a dataclass of groups such as crop and ground.
         warning: reason why scores are unreliable or classes are never detected, or None.
     """
 
@@ -42,7 +42,7 @@ class NetworkDetector:
         Raises:
             InputError: bad input, or CUDA is out of memory and the parameter cpu_fallback is off.
         """
-        frame, ground, cluster_ids, problem = accept(cloud, ground, cluster_ids, self.settings.use_intensity)
+        frame, ground, cluster_ids, problem = check_input(cloud, ground, cluster_ids, self.settings.use_intensity)
         if self.params.crop.enabled:
             indices, frame = crop_with_sensor_pose(frame, self.params.crop, self.params.ground.sensor_pose)
             ground, cluster_ids = (
@@ -57,7 +57,7 @@ class NetworkDetector:
 
     @property
     def settings(self) -> NetworkParams:
-        """The group of `params` with the settings of this detector."""
+        """The detector's own parameter group, `group` of `params`."""
         return getattr(self.params, self.group)
 
     @property
@@ -76,12 +76,12 @@ class NetworkDetector:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of the classes that the detector can detect."""
+        """Names of the detectable classes."""
         return self.networks[0].classes
 
     @property
     def min_scores(self) -> dict[str, float]:
-        """Threshold of each class, 0..1."""
+        """Score threshold of each class, 0..1."""
         return self.settings.scores.get_all(self.classes)
 
     @property
@@ -91,7 +91,7 @@ class NetworkDetector:
         return "around" if low is None or low[0] < 0 else "ahead"
 
     def with_params(self, params: Any) -> Self:
-        """Return a copy of this detector with other parameters and the same networks."""
+        """Return a copy of this detector with different parameters and the same networks."""
         other = copy.copy(self)
         other.params = params
         return other
@@ -106,10 +106,10 @@ class NetworkDetector:
         return self.with_params(set_sensor_height(self.params, height))
 
     def with_range(self, range: str) -> Self:
-        """Return a copy of this detector with another range.
+        """Return a copy of this detector with a different range.
 
         Args:
-            range: ahead, around, or auto (the range of the training). PointNet
+            range: ahead, around, or auto (the range the network was trained for). PointNet
                 always covers all directions.
 
         Raises:
@@ -125,12 +125,12 @@ class NetworkDetector:
 
 
 def make_synthetic_frame(pose: SensorPoseParams) -> PointCloud:
-    """Return a synthetic cloud that triggers JIT compilation of every stage: flat ground with three objects."""
+    """Return flat ground with three objects, a cloud that triggers JIT compilation of every stage."""
     rng = np.random.default_rng(0)
     ground = rng.uniform(0, 40, (2000, 3)) * [1, 1, 0.001] - [0, 20, SENSOR_HEIGHT]
-    target = rng.uniform(-0.5, 0.5, (400, 3)) + [8, 0, -0.8]
-    dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 4, -0.8]  # DBSCAN uses a different code path for dense points
-    at_band_limit = rng.uniform(-0.3, 0.3, (400, 3)) + [15, 0, -0.8]  # two bands of DBSCAN meet at 15 m
-    xyz = np.concatenate([ground, target, dense, at_band_limit]).astype(np.float32)
+    sparse_object = rng.uniform(-0.5, 0.5, (400, 3)) + [8, 0, -0.8]
+    dense_object = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 4, -0.8]  # DBSCAN has a separate code path for it
+    split_object = rng.uniform(-0.3, 0.3, (400, 3)) + [15, 0, -0.8]  # two range bands of DBSCAN meet at 15 m
+    xyz = np.concatenate([ground, sparse_object, dense_object, split_object]).astype(np.float32)
     xyz[:, 2] -= pose.height - SENSOR_HEIGHT
     return PointCloud(xyz, rng.uniform(0.1, 0.9, len(xyz)).astype(np.float32))

@@ -1,7 +1,7 @@
-"""Corrections of a network's boxes: towards another network's boxes, the ground and the points.
+"""Box refinement: move a network's boxes towards those of another network, the ground and the points.
 
-Two networks make different errors. A network trained on simulated scans places real cars slightly
-too far away and not exactly on the ground. The points show better where a visible face is.
+Different networks make different errors. A network trained on simulated scans places real cars
+slightly too far away and not exactly on the ground. Points locate the visible faces more precisely.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from numba import njit
 from lidar_perception.classes import CAR
 from lidar_perception.geometry import points_in_boxes, quantile, wrap_angle, wrap_line
 
-MARGIN_M = 0.4  # margin around a box within which points belong to it
-MIN_HEIGHT_M = 0.2  # lower points in a box are not used
-MIN_FACE_POINTS = 30  # faces with fewer points are not used
-FACE_QUANTILE = 0.03  # quantile of the point depths that is taken as the surface of a face
-# Depth of that quantile behind a labelled face, in metres, measured on 60 simulated scans.
-FRONT, REAR, SIDE = 0.03, 0.03, -0.01
+MARGIN_M = 0.4  # points up to this distance outside a box belong to its object
+MIN_HEIGHT_M = 0.2  # minimum height of a point above the bottom of its box; lower points may be ground
+MIN_FACE_POINTS = 30  # minimum number of points on a face
+FACE_QUANTILE = 0.03  # quantile of the point depths that represents the surface of a face
+# Depth of this quantile behind the faces of labelled boxes, in metres, measured on 60 simulated scans.
+FRONT_DEPTH, REAR_DEPTH, SIDE_DEPTH = 0.03, 0.03, -0.01
 MIN_FACE_SLOPE = 0.3  # tangent of the minimum viewing angle of a face
 
 
@@ -49,10 +49,10 @@ def move_to_ground(boxes: np.ndarray, ground_heights: np.ndarray, weight: float)
 
 
 def move_cars_to_points(boxes: np.ndarray, class_ids: np.ndarray, xyz: np.ndarray, weight: float) -> np.ndarray:
-    """Apply move_to_points to the cars among boxes (K, 7); return all boxes as float64."""
-    moved, cars = np.array(boxes, np.float64), class_ids == CAR
-    if weight and cars.any():
-        moved[cars] = move_to_points(moved[cars], xyz, weight)
+    """Apply move_to_points to the cars among boxes (K, 7), and return all boxes as float64."""
+    moved, is_car = np.array(boxes, np.float64), class_ids == CAR
+    if weight and is_car.any():
+        moved[is_car] = move_to_points(moved[is_car], xyz, weight)
     return moved
 
 
@@ -63,7 +63,7 @@ def move_to_points(boxes: np.ndarray, xyz: np.ndarray, weight: float) -> np.ndar
     MIN_FACE_POINTS points does not move its box.
 
     Args:
-        weight: 0 keeps the boxes, 1 moves the faces all the way.
+        weight: 0 keeps the boxes, 1 moves their faces all the way to the points.
     """
     indices, first = points_in_boxes(xyz, boxes, MARGIN_M)
     return _move_to_points(np.asarray(boxes, np.float64), xyz[indices].astype(np.float64), first, weight)
@@ -75,22 +75,22 @@ def _move_to_points(boxes, points, first, weight):
     for k in range(len(boxes)):
         x, y, z = boxes[k, :3]
         cos, sin = np.cos(boxes[k, 6]), np.sin(boxes[k, 6])
-        sensor = np.array([-cos * x - sin * y, sin * x - cos * y])
+        sensor_xy = np.array([-cos * x - sin * y, sin * x - cos * y])  # in the coordinates of the box
         box_points = points[first[k] : first[k + 1]]
         box_points = box_points[box_points[:, 2] > z - boxes[k, 5] / 2 + MIN_HEIGHT_M]
-        flat = np.empty((len(box_points), 2))
-        flat[:, 0] = cos * (box_points[:, 0] - x) + sin * (box_points[:, 1] - y)
-        flat[:, 1] = cos * (box_points[:, 1] - y) - sin * (box_points[:, 0] - x)
+        box_xy = np.empty((len(box_points), 2))
+        box_xy[:, 0] = cos * (box_points[:, 0] - x) + sin * (box_points[:, 1] - y)
+        box_xy[:, 1] = cos * (box_points[:, 1] - y) - sin * (box_points[:, 0] - x)
         for axis in range(2):
-            half, side = boxes[k, 3 + axis] / 2, np.sign(sensor[axis])
-            if abs(sensor[axis]) <= half or (abs(sensor[axis]) < MIN_FACE_SLOPE * abs(sensor[1 - axis])):
+            half_size, sign = boxes[k, 3 + axis] / 2, np.sign(sensor_xy[axis])
+            if abs(sensor_xy[axis]) <= half_size or (abs(sensor_xy[axis]) < MIN_FACE_SLOPE * abs(sensor_xy[1 - axis])):
                 continue
-            face = flat[np.abs(flat[:, 1 - axis]) <= boxes[k, 4 - axis] / 2 + 0.1]
-            if len(face) < MIN_FACE_POINTS:
+            face_xy = box_xy[np.abs(box_xy[:, 1 - axis]) <= boxes[k, 4 - axis] / 2 + 0.1]
+            if len(face_xy) < MIN_FACE_POINTS:
                 continue
-            depth = quantile(half - side * face[:, axis], FACE_QUANTILE)
-            expected = SIDE if axis == 1 else (FRONT if side > 0 else REAR)
-            offset = -side * weight * min(max(depth - expected, -MARGIN_M), MARGIN_M)
+            depth = quantile(half_size - sign * face_xy[:, axis], FACE_QUANTILE)
+            expected_depth = SIDE_DEPTH if axis == 1 else (FRONT_DEPTH if sign > 0 else REAR_DEPTH)
+            offset = -sign * weight * min(max(depth - expected_depth, -MARGIN_M), MARGIN_M)
             moved[k, 0] += offset * (cos if axis == 0 else -sin)
             moved[k, 1] += offset * (sin if axis == 0 else cos)
     return moved

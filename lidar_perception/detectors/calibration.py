@@ -1,8 +1,8 @@
-"""Calibration of scores to probabilities: a straight line in the log-odds per class (Platt, 1999).
+"""Calibration of scores to probabilities: one straight line in log-odds per class (Platt, 1999).
 
-The header of the weights contains the lines. They are fitted to scans outside the training set
-(scoring/kitti/reliability.py). Their slopes are positive, so the order of scores, and with it
-average precision, does not change.
+The lines are stored in the header of the weights and fitted to scans outside the training set
+(scoring/kitti/reliability.py). Their slopes are positive, so calibration changes neither the order
+of the scores nor the average precision.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from scipy.special import expit, logit
 
 from lidar_perception.types import CLASSES, Detections
 
-Lines = Mapping[str, tuple[float, float]]  # class -> (slope > 0, offset), in log-odds
+CalibrationLines = Mapping[str, tuple[float, float]]  # class -> (slope > 0, offset), in log-odds
 
 
-def calibrate_scores(detections: Detections, lines: Lines) -> Detections:
+def calibrate_scores(detections: Detections, lines: CalibrationLines) -> Detections:
     """Replace scores by calibrated probabilities; scores of classes without a line do not change."""
     scores = detections.scores.copy()
     for name, (slope, offset) in lines.items():
@@ -29,7 +29,7 @@ def calibrate_scores(detections: Detections, lines: Lines) -> Detections:
     return replace(detections, scores=scores)
 
 
-def to_raw_score(name: str, score: float, lines: Lines) -> float:
+def to_raw_score(name: str, score: float, lines: CalibrationLines) -> float:
     """Return the raw network score of class `name` that calibration maps to `score`."""
     if name not in lines or score in (0.0, 1.0):
         return score

@@ -22,7 +22,7 @@ from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import CLASSES, InputError
 
-KEY = "lidar_perception"  # key of the header in the metadata, whose values are strings
+KEY = "lidar_perception"  # metadata key of the header, a JSON string
 FORMAT = 1
 MAX_COEFFICIENT = 100.0  # maximum absolute value of a slope or offset of a calibration
 MIN_HEIGHT_DIFFERENCE_M = 0.3  # smaller differences in mounting height need no warning
@@ -34,21 +34,21 @@ Net = TypeVar("Net", bound="torch.nn.Module")
 
 
 class Config(Protocol):
-    """Dataclass that describes a network; `network` is its key in NETWORKS."""
+    """Dataclass that describes a network; `network` is a key in NETWORKS."""
 
     network: ClassVar[str]
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of the detected classes."""
+        """Names of the detectable classes."""
 
     @property
     def title(self) -> str:
-        """Name of this variant of the network."""
+        """Name of the network variant."""
 
 
 POINTPILLARS, POINTNET = NetworkConfig.network, PointNetConfig.network
-NETWORKS: dict[str, tuple[str, str, type[Config]]] = {  # kind -> (title, use, config class)
+NETWORKS: dict[str, tuple[str, str, type[Config]]] = {  # key -> (title, use, config type)
     POINTPILLARS: ("PointPillars", "the node pointpillars_detector and pointpillars.weights", NetworkConfig),
     POINTNET: ("PointNet", "the node pointnet_detector and pointnet.weights", PointNetConfig),
 }
@@ -59,11 +59,11 @@ class Header:
     """Metadata of a checkpoint; all values are JSON serializable.
 
     Attributes:
-        config: description of the network.
-        training: data, steps, time and seed.
+        config: network config.
+        training: data, steps, duration and seed of the training.
         metrics: AP and other scores; may be empty.
         commit: git commit of the training code.
-        calibration: see calibration.py; empty for raw scores.
+        calibration: lines by class, see calibration.py; empty for raw scores.
     """
 
     config: Any
@@ -74,13 +74,13 @@ class Header:
 
     @property
     def network(self) -> str:
-        """Name of the network in NETWORKS."""
+        """Key of the network in NETWORKS."""
         return self.config.network
 
     def find_height_mismatch(self, height: float) -> str | None:
-        """Return a warning if the weights were trained for a sensor height other than `height` metres.
+        """Return a warning if the weights were trained for a different sensor height than `height` metres.
 
-        None if the heights agree or the training height is unknown.
+        None if the heights agree or the height in training is unknown.
         """
         sensor = self.training.get("sensor")
         if (
@@ -90,7 +90,7 @@ class Header:
         ):
             return None
         sensor_text = f"the sensor {sensor['name']}" if sensor.get("name") else "a sensor"
-        return f"trained for {sensor_text} at {sensor['height']:g} m, used with one at {height:g} m"
+        return f"trained for {sensor_text} at {sensor['height']:g} m, but used with a sensor at {height:g} m"
 
     def to_json(self) -> str:
         """Return the header as JSON text."""
@@ -112,16 +112,18 @@ class Header:
 
         Args:
             source: name of the file, for messages.
-            config_class: expected class of the config; None: any.
+            config_class: config type that the header must have; None: any.
 
         Raises:
-            InputError: the text is not a header, or its config is of another class.
+            InputError: the text is not a header, or its config has a different type.
         """
         content = _parse_header(text, source)
         title, use, config = NETWORKS[content["network"]]
         if config_class is not None and content["network"] != config_class.network:
             expected_title, expected_use, _ = NETWORKS[config_class.network]
-            raise InputError(f"{source} contains a {title} for {use}; {expected_use} require a {expected_title}")
+            raise InputError(
+                f"{source} contains a {title} network for {use}; {expected_use} require a {expected_title} network"
+            )
         return Header(
             parse_config(config, content["config"], source),
             content["training"],
@@ -131,29 +133,31 @@ class Header:
         )
 
 
-PARTS = {"config": dict, "training": dict, "metrics": dict, "commit": str}
+FIELD_TYPES = {"config": dict, "training": dict, "metrics": dict, "commit": str}  # required fields of a header
 
 
 def _parse_header(text: str | None, source: str) -> dict[str, Any]:
-    """Parse a header and check its parts and its network."""
+    """Parse a header and check its fields and its network."""
     try:
         content = json.loads(text or "")
-        parts = {name: content[name] for name in ("format", *PARTS)}
-        network = content.get("network", POINTPILLARS)  # files of early versions lack this key
+        fields = {name: content[name] for name in ("format", *FIELD_TYPES)}
+        network = content.get("network", POINTPILLARS)  # missing in files of early versions
         calibration = content.get("calibration", {})
-        if not all(isinstance(parts[name], part_type) for name, part_type in PARTS.items()):
+        if not all(isinstance(fields[name], field_type) for name, field_type in FIELD_TYPES.items()):
             raise TypeError
     except (TypeError, ValueError, KeyError, AttributeError, RecursionError):
         raise InputError(
-            f"{source} has no header of this package; use import-weights for weights of other projects"
+            f"{source} has no lidar_perception header; convert weights of other projects with import-weights"
         ) from None
-    if parts["format"] != FORMAT:
-        raise InputError(f"{source} has format {str(parts['format'])[:40]}, this version supports {FORMAT}")
+    if fields["format"] != FORMAT:
+        raise InputError(
+            f"{source} has format version {str(fields['format'])[:40]}, but only version {FORMAT} is supported"
+        )
     if not isinstance(network, str) or network not in NETWORKS:
         raise InputError(
-            f"{source} contains an unknown network {str(network)[:40]!r}; supported are {' and '.join(NETWORKS)}"
+            f"{source} contains the unknown network {str(network)[:40]!r}; supported: {', '.join(NETWORKS)}"
         )
-    return {"network": network, "calibration": calibration, **parts}
+    return {"network": network, "calibration": calibration, **fields}
 
 
 def _parse_calibration(content: Any, source: str) -> dict[str, tuple[float, float]]:
@@ -166,11 +170,15 @@ def _parse_calibration(content: Any, source: str) -> dict[str, tuple[float, floa
             return lines
     except (TypeError, ValueError, AttributeError, OverflowError):
         pass
-    raise InputError(f"{source} has an invalid calibration; it needs a slope above 0 and an offset for each class")
+    raise InputError(f"{source} has an invalid calibration; expected a slope above 0 and an offset for each class")
 
 
 def read_network_name(path: str | Path) -> str:
-    """Return the key in NETWORKS of a checkpoint. InputError if the file is not a checkpoint."""
+    """Return the key in NETWORKS of a checkpoint's network.
+
+    Raises:
+        InputError: the file is not a checkpoint.
+    """
     return _parse_header(_read(Path(path), tensors=False)[0], str(path))["network"]
 
 
@@ -182,18 +190,18 @@ def save_checkpoint(path: str | Path, network: torch.nn.Module, header: Header, 
     """
     from safetensors.torch import save
 
-    tensors = {name: _to_stored(value, half) for name, value in network.state_dict().items()}
+    tensors = {name: _convert_to_stored(value, half) for name, value in network.state_dict().items()}
     write_bytes(path, save(tensors, {KEY: header.to_json()}))
 
 
 def save_header(path: Path, header: Header) -> None:
-    """Replace the header of a checkpoint and leave its tensors unchanged."""
+    """Replace the header of a checkpoint; the tensors remain unchanged."""
     from safetensors.torch import save
 
     write_bytes(path, save(_read(path)[1], {KEY: header.to_json()}))
 
 
-def _to_stored(value: torch.Tensor, half: bool) -> torch.Tensor:
+def _convert_to_stored(value: torch.Tensor, half: bool) -> torch.Tensor:
     import torch
 
     value = value.detach().cpu()
@@ -206,16 +214,21 @@ def read_header(path: str | Path, config_class: type[Config] | None = None) -> H
     """Read the header of a checkpoint.
 
     Args:
-        config_class: expected class of the config; None: any.
+        config_class: config type that the checkpoint must have; None: any.
 
     Raises:
-        InputError: the file is missing or broken, has no header, or has a config of another class.
+        InputError: the file is missing or damaged, or has no header, or its config has a different
+            type.
     """
     return Header.from_json(_read(Path(path), tensors=False)[0], str(path), config_class)
 
 
 def read_checkpoint(path: str | Path, config_class: type[Config]) -> tuple[Header, dict[str, torch.Tensor]]:
-    """Read the header and the tensors, on the CPU with the dtypes of the file. InputError as in read_header."""
+    """Read the header and the tensors, on the CPU with the dtypes of the file.
+
+    Raises:
+        InputError: see read_header.
+    """
     text, tensors = _read(Path(path))
     return Header.from_json(text, str(path), config_class), tensors
 
@@ -225,7 +238,7 @@ def read_arrays(path: str | Path, config_class: type[Config]) -> tuple[Header, d
 
     Raises:
         InputError: see read_header.
-        WeightsMismatch: a tensor has a number format that NumPy lacks, such as bf16.
+        WeightsMismatch: a tensor has a number format that NumPy does not support, such as bf16.
     """
     try:
         text, tensors = _read(Path(path), framework="np")
@@ -240,8 +253,8 @@ def load_checkpoint(
     """Load the header and the network of a checkpoint, in float32, on the CPU and in training mode.
 
     Args:
-        config_class: class of the config.
-        make: make(config) returns the network without weights.
+        config_class: config type that the checkpoint must have.
+        make: function that makes an untrained network from a config.
         expected: config that the checkpoint must have; None: any.
 
     Raises:
@@ -258,7 +271,7 @@ def load_checkpoint(
         required, actual = (_describe_tensor(state.get(name)) for state in (state_dict, tensors))
         if required != actual:
             raise InputError(
-                f"the weights in {path} do not fit its header: {name[:80]} is {actual}, expected {required}"
+                f"the weights in {path} do not match its header: {name[:80]} is {actual}, expected {required}"
             )
     network = make(header.config)
     network.load_state_dict({name: value.to(state_dict[name].dtype) for name, value in tensors.items()})
@@ -273,16 +286,16 @@ def _describe_tensor(value: torch.Tensor | None) -> str:
 
 
 def copy_matching_weights(network: torch.nn.Module, path: str | Path, config_class: type[Config]) -> tuple[int, int]:
-    """Copy matching weights of a checkpoint into a network for fine-tuning; configs may differ.
+    """Initialize a network for fine-tuning with the matching weights of a checkpoint; configs may differ.
 
     Tensors with the same name and shape are copied. If only the number of inputs differs, the
-    common inputs are copied and the new ones are set to 0. All other tensors remain unchanged.
+    common inputs are copied and new inputs are set to 0. All other tensors remain unchanged.
 
     Args:
-        config_class: class of the config.
+        config_class: config type that the checkpoint must have.
 
     Returns:
-        Number of copied tensors and total number of tensors of the network.
+        Number of copied tensors, and total number of tensors of the network.
 
     Raises:
         InputError: see read_header, or no tensor matches.
@@ -304,17 +317,17 @@ def copy_matching_weights(network: torch.nn.Module, path: str | Path, config_cla
             continue
         copied += 1
     if not copied:
-        raise InputError(f"no layer of {path} matches the network to train")
+        raise InputError(f"no layer in {path} matches the network to train")
     return copied, len(state)
 
 
 def require_same_config(config: Any, expected: Any, source: str) -> None:
     """Raise an InputError that lists the first fields in which two configs differ."""
     required, actual = dataclasses.asdict(expected), dataclasses.asdict(config)
-    different = [name for name in required if required[name] != actual[name]]
-    if different:
-        fields = "; ".join(f"{name} is {actual[name]}, expected {required[name]}" for name in different[:3])
-        raise InputError(f"{source} contains another network: {fields}")
+    different_names = [name for name in required if required[name] != actual[name]]
+    if different_names:
+        fields = "; ".join(f"{name} is {actual[name]}, expected {required[name]}" for name in different_names[:3])
+        raise InputError(f"{source} contains a different network: {fields}")
 
 
 def _read(path: Path, tensors: bool = True, framework: str = "pt") -> tuple[str | None, dict[str, Any]]:
@@ -324,11 +337,11 @@ def _read(path: Path, tensors: bool = True, framework: str = "pt") -> tuple[str 
         framework: type of the tensors: pt (torch) or np (NumPy).
     """
     if not path.is_file():
-        raise InputError(f"there is no checkpoint {path}")
+        raise InputError(f"checkpoint not found: {path}")
     try:
-        with safe_open(path, framework if tensors else "np") as opened:
-            text = (opened.metadata() or {}).get(KEY)
-            names = opened.keys() if tensors and text else ()
-            return text, {name: opened.get_tensor(name) for name in names}
+        with safe_open(path, framework if tensors else "np") as file:
+            text = (file.metadata() or {}).get(KEY)
+            names = file.keys() if tensors and text else ()
+            return text, {name: file.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:
         raise InputError(f"{path} is not a checkpoint, or is truncated: {error}") from None

@@ -21,9 +21,9 @@ class DetectionResult:
     """The result of a detector for one cloud.
 
     Attributes:
-        detections: in the coordinates of the cloud, without the vehicle that carries the sensor.
-        timings: milliseconds of each step (on CUDA after synchronisation).
-        problem: reason why little or nothing can be detected, with the remedy; None if all is well.
+        detections: detections in the coordinates of the cloud, without the ego vehicle.
+        timings: duration of each step in milliseconds (on CUDA after synchronization).
+        problem: reason why few or no objects can be detected, with a remedy, or None.
         best: highest score of each class if no score reached its threshold, otherwise empty.
     """
 
@@ -38,7 +38,7 @@ class Detector(Protocol):
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of the classes that the detector can detect, a subset of types.CLASSES."""
+        """Names of the detectable classes, a subset of types.CLASSES."""
 
     @property
     def min_scores(self) -> Mapping[str, float]:
@@ -66,13 +66,13 @@ class Detector(Protocol):
         """
 
 
-class Accepted(NamedTuple):
-    """Checked arguments of a detector.
+class CheckedInput(NamedTuple):
+    """Arguments of a detector after check_input().
 
     Attributes:
-        frame: the usable points of the cloud, with the intensity in 0..1.
-        ground, cluster_ids: values of these points, or None.
-        problem: problem of the intensity scale, see find_scale_problem.
+        frame: the usable points of the cloud, with intensity in 0..1.
+        ground, cluster_ids: values for these points, or None.
+        problem: problem with the intensity scale, see find_scale_problem, or None.
     """
 
     frame: PointCloud
@@ -81,13 +81,13 @@ class Accepted(NamedTuple):
     problem: str | None = None
 
 
-def accept(
+def check_input(
     cloud: Cloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None, use_intensity: bool = True
-) -> Accepted:
-    """Check and convert the arguments of a detector, see Detector.__call__.
+) -> CheckedInput:
+    """Check and convert the arguments of Detector.__call__.
 
-    An intensity outside 0..1 is divided by its apparent scale. The scale is guessed from one cloud,
-    so it is also reported as a problem.
+    Intensities outside 0..1 are divided by a scale that is guessed from this cloud alone, so the
+    scale is also reported as a problem.
 
     Args:
         use_intensity: False if the detector ignores the intensity.
@@ -105,11 +105,11 @@ def accept(
         scale = guess_scale(frame.intensity)
         if scale != 1.0:
             frame = replace(frame, intensity=to_unit(frame.intensity, scale))
-    return Accepted(frame, ground, cluster_ids, problem)
+    return CheckedInput(frame, ground, cluster_ids, problem)
 
 
 def join_problems(*problems: str | None) -> str | None:
-    """Join problems in order, without those that a later one contains; None if there are none."""
+    """Join messages in order, skipping those that a later one contains; None if there are none."""
     texts = [problem for problem in problems if problem]
     unique = [text for i, text in enumerate(texts) if not any(text in later for later in texts[i + 1 :])]
     return "; ".join(unique) or None

@@ -18,7 +18,7 @@ from typing import Any, cast
 import numpy as np
 
 from lidar_perception.classes import DETECTED
-from lidar_perception.detectors.contract import Cloud, DetectionResult, Detector, accept
+from lidar_perception.detectors.contract import Cloud, DetectionResult, Detector, check_input
 from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.ground.params import SensorPoseParams, set_sensor_height
 from lidar_perception.param_fields import Params
@@ -35,7 +35,7 @@ from lidar_perception.types import (
 
 ENTRY_POINTS = "lidar_perception.detectors"  # group of entry points: NAME = "module:Class"
 REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
-ARGUMENTS = "sensor_height", "device", "range"  # keyword arguments, passed if the class accepts them
+ARGUMENTS = "sensor_height", "device", "range"  # keyword arguments that are passed if the class accepts them
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class CustomParams(Params):
 
 @dataclass(frozen=True)
 class CustomDetectorParams:
-    """Parameter groups of a custom detector; settings of the class itself are not included."""
+    """Parameter groups of a custom detector, without the settings of the class itself."""
 
     crop: CropParams = CropParams()
     ground: MountParams = MountParams()
@@ -63,14 +63,15 @@ class CustomDetectorParams:
 
 @dataclass
 class CustomDetector:
-    """Adapter from a function of a cloud to contract.Detector.
+    """Adapter that turns a function from a cloud to Detections into a contract.Detector.
 
     Attributes:
         name: name of the detector in messages.
-        build: returns the detector function for a sensor height in metres.
+        build: returns the detection function for a sensor height in metres.
         classes: names of the detectable classes.
-        params: crop, mounting pose and, in the group `group`, the thresholds.
-        device: device shown in the status of a node.
+        params: parameter groups: crop, ground, and `group` with the score thresholds.
+        group: name of the parameter group with the score thresholds.
+        device: device name shown in the status of a node.
     """
 
     name: str
@@ -82,7 +83,7 @@ class CustomDetector:
 
     @property
     def scores(self) -> ScoreParams:
-        """Thresholds by class."""
+        """Score thresholds by class."""
         return getattr(self.params, self.group).scores
 
     @property
@@ -91,7 +92,7 @@ class CustomDetector:
         return {name: self.scores.get(name) for name in self.classes}
 
     def with_params(self, params: Any) -> CustomDetector:
-        """Return a copy of this detector with other parameters."""
+        """Return a copy of this detector with different parameters."""
         return replace(self, params=params)
 
     def with_min_score(self, min_score: float) -> CustomDetector:
@@ -112,7 +113,7 @@ class CustomDetector:
         Raises:
             RunError: the function did not return Detections.
         """
-        frame, _, _, problem = accept(cloud, ground, cluster_ids)
+        frame, _, _, problem = check_input(cloud, ground, cluster_ids)
         pose = self.params.ground.sensor_pose
         if self.params.crop.enabled:
             from lidar_perception.ground.segment import crop_with_sensor_pose  # loads Numba
@@ -130,7 +131,7 @@ class CustomDetector:
 
 
 def as_detector(detector: Detector | Callable[[PointCloud], Detections]) -> Detector:
-    """Return a Detector unchanged; wrap any other function of a cloud in a CustomDetector.
+    """Return a Detector unchanged, and wrap any other function of a cloud in a CustomDetector.
 
     Raises:
         InputError: the argument is not callable, or is a class instead of an instance.
@@ -169,24 +170,24 @@ def load_custom_detector(
     Raises:
         InputError: the module or class is missing or fails, or the class has no argument `range`.
     """
-    make = _find_class(reference)
-    accepted = _find_arguments(make)
-    if range != "auto" and "range" not in accepted:
+    detector_class = _find_class(reference)
+    supported_names = _find_arguments(detector_class)
+    if range != "auto" and "range" not in supported_names:
         raise InputError(f"{reference} has no argument `range`; omit the range, or add the argument to the class")
-    values = {name: value for name, value in (("device", device), ("range", range)) if name in accepted}
+    arguments = {name: value for name, value in (("device", device), ("range", range)) if name in supported_names}
 
     @lru_cache(maxsize=2)
     def build(height: float | None) -> Callable[[PointCloud], Any]:
-        arguments = values if height is None else {**values, "sensor_height": height}
+        height_argument = {} if height is None else {"sensor_height": height}
         try:
-            detector = make(**arguments)
+            detector = detector_class(**arguments, **height_argument)
         except Exception as error:
-            raise InputError(f"{reference} cannot be created: {_describe(error)}") from error
+            raise InputError(f"cannot create {reference}: {_describe(error)}") from error
         if not callable(detector):
             raise InputError(f"{reference} has no method __call__(cloud) -> Detections")
         return detector
 
-    takes_height = "sensor_height" in accepted
+    takes_height = "sensor_height" in supported_names
     params = CustomDetectorParams() if params is None else params
     detector = build(params.ground.sensor_pose.height if takes_height else None)
     return CustomDetector(
@@ -202,31 +203,31 @@ def load_custom_detector(
 def _find_class(reference: str) -> Callable[..., Any]:
     module_name, _, class_name = reference.partition(":")
     if (folder := os.getcwd()) not in sys.path:
-        sys.path.append(folder)  # `python -m` has it on the path, but a console script does not
+        sys.path.append(folder)  # `python -m` does this itself, but console scripts do not
     try:
         value: Any = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
-            raise InputError(f"{module_name} cannot be imported: {_describe(error)}") from error
+            raise InputError(f"cannot import {module_name}: {_describe(error)}") from error
         raise InputError(
-            f"there is no module {module_name!r}; run the command in its folder, or add its folder to PYTHONPATH"
+            f"no module named {module_name!r}; run the command in its folder, or add its folder to PYTHONPATH"
         ) from None
     except Exception as error:
-        raise InputError(f"{module_name} cannot be imported: {_describe(error)}") from error
+        raise InputError(f"cannot import {module_name}: {_describe(error)}") from error
     for name in class_name.split("."):
         if not hasattr(value, name):
             class_names = [key for key, candidate in vars(value).items() if isinstance(candidate, type)]
             raise InputError(f"{module_name} has no class {class_name!r}{suggest_name(class_name, class_names)}")
         value = getattr(value, name)
     if not callable(value):
-        raise InputError(f"{reference} is not a class but {type(value).__name__}")
+        raise InputError(f"{reference} is of type {type(value).__name__}, not a class")
     return value
 
 
-def _find_arguments(make: Callable[..., Any]) -> set[str]:
+def _find_arguments(detector_class: Callable[..., Any]) -> set[str]:
     """Return the ARGUMENTS that a class accepts as keywords."""
     try:
-        parameters = inspect.signature(make).parameters
+        parameters = inspect.signature(detector_class).parameters
     except ValueError:  # the class is written in C
         return set()
     return {

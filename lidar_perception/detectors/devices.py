@@ -1,6 +1,6 @@
 """Device and number format of a network.
 
-A device is given by its name, such as cpu or cuda:1. torch is imported only if a GPU may be used.
+Devices are given by name, such as cpu or cuda:1. torch is imported only if a GPU may be used.
 """
 
 from __future__ import annotations
@@ -30,16 +30,15 @@ def find_device(name: str = "auto") -> str:
         return CPU
     match = re.fullmatch(r"auto|cuda(?::(\d+))?", name)
     if not match:
-        raise InputError(f"there is no device {name!r}; choose auto, cpu, cuda or cuda:N")
+        raise InputError(f"unknown device {name!r}; choose auto, cpu, cuda or cuda:N")
     import torch  # slow to import
 
-    available = torch.cuda.is_available()
+    device_count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if name == "auto":
-        return "cuda" if available else CPU
-    if not (available and int(match[1] or 0) < torch.cuda.device_count()):
+        return "cuda" if device_count else CPU
+    if int(match[1] or 0) >= device_count:
         raise InputError(
-            f"device {name!r} is not available: torch finds "
-            f"{torch.cuda.device_count() if available else 'no'} CUDA device; choose auto or cpu"
+            f"device {name!r} is not available (CUDA devices found by torch: {device_count}); choose auto or cpu"
         )
     return name
 
@@ -55,21 +54,21 @@ def _has_gpu_driver() -> bool:
     return True
 
 
-def uses_16_bits(amp: str) -> bool:
-    """Return True if `amp` selects bf16 on the CPU; see params.make_amp_param."""
+def uses_bf16_on_cpu(amp: str) -> bool:
+    """Return True if the parameter `amp` selects bf16 on the CPU, see params.make_amp_param."""
     return amp == "bf16" or (amp == "auto" and has_bf16())
 
 
 def choose_dtype(amp: str, device: str | torch.device) -> torch.dtype | None:
-    """Return the dtype of autocast for a network's layers; None for float32.
+    """Return the autocast dtype of a network's layers; None for float32.
 
     Args:
-        amp: off, bf16, fp16 (CUDA only), or auto: 16 bits if the device supports it.
+        amp: off, bf16, fp16 (CUDA only), or auto for 16 bits if the device supports it.
     """
     import torch
 
     if torch.device(device).type == CPU:
-        return torch.bfloat16 if uses_16_bits(amp) else None
+        return torch.bfloat16 if uses_bf16_on_cpu(amp) else None
     if amp == "off":
         return None
     if amp == "auto":

@@ -9,18 +9,23 @@ import numpy as np
 
 
 class WeightsMismatch(ValueError):
-    """The tensors do not fit the network; checkpoint.load_checkpoint() names the first mismatch."""
+    """The tensors do not fit the network; checkpoint.load_checkpoint() reports the first mismatch."""
 
 
 class Weights(NamedTuple):
-    """Weight, (O, I, kh, kw) for a convolution or (O, I) for a linear layer, and bias (O,) or None; float32."""
+    """Weights of a layer, float32.
+
+    Attributes:
+        weight: (O, I, kh, kw) for a convolution, (O, I) for a linear layer.
+        bias: (O,), or None.
+    """
 
     weight: np.ndarray
     bias: np.ndarray | None
 
 
 class LayerWeights:
-    """Layers of a network by name; each layer can be taken once.
+    """Weights of the layers of a network; each layer can be taken once.
 
     Args:
         tensors: state_dict of the torch network as NumPy arrays.
@@ -35,11 +40,11 @@ class LayerWeights:
 
         Args:
             shape: expected shape of the weight.
-            norm: name of the batch norm after a layer without bias. If the file has no such norm,
-                it is already folded into the layer, which then has a bias.
+            norm: name of the batch norm that follows the layer. If the file does not contain it, it
+                is already folded into the layer, which then has a bias.
 
         Raises:
-            WeightsMismatch: the layer is missing or has another shape.
+            WeightsMismatch: the layer is missing or has a different shape.
         """
         weight = self.take_array(f"{name}.weight", shape)
         if norm is None or f"{norm}.weight" not in self.tensors:
@@ -47,20 +52,24 @@ class LayerWeights:
         scale, shift, mean, variance = (
             self.take_array(f"{norm}.{part}", shape[:1]) for part in ("weight", "bias", "running_mean", "running_var")
         )
-        count = self.tensors.pop(f"{norm}.num_batches_tracked", None)
-        if count is None or count.shape or count.dtype != np.int64:
+        batch_count = self.tensors.pop(f"{norm}.num_batches_tracked", None)
+        if batch_count is None or batch_count.shape or batch_count.dtype != np.int64:
             raise WeightsMismatch(f"{norm}.num_batches_tracked")
         scale = scale / np.sqrt(variance + np.float32(self.eps))
         return Weights(weight * scale.reshape(-1, *[1] * (len(shape) - 1)), shift - mean * scale)
 
     def take_array(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
-        """Remove a floating point tensor and return it as float32. WeightsMismatch if it does not fit."""
+        """Remove a floating point tensor and return it as float32.
+
+        Raises:
+            WeightsMismatch: the tensor is missing, or its shape or type differs.
+        """
         tensor = self.tensors.pop(name, None)
         if tensor is None or tensor.shape != shape or not np.issubdtype(tensor.dtype, np.floating):
             raise WeightsMismatch(name)
         return tensor.astype(np.float32)
 
-    def finish(self) -> None:
+    def require_all_taken(self) -> None:
         """Raise WeightsMismatch if a tensor has not been taken."""
         for name in self.tensors:
             raise WeightsMismatch(name)

@@ -1,4 +1,4 @@
-"""Exact non-maximum suppression of rotated boxes.
+"""Exact non-maximum suppression (NMS) of rotated boxes.
 
 It runs on the CPU, which is faster than a GPU for the few hundred boxes above the threshold.
 """
@@ -16,7 +16,7 @@ from lidar_perception.types import CLASSES, Detections
 def apply_nms(
     boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, classes: tuple[str, ...], params: NmsParams
 ) -> Detections:
-    """Apply NMS and return the remaining boxes as detections, best score first.
+    """Apply NMS and return the remaining boxes as detections, highest score first.
 
     Args:
         boxes: (N, 7).
@@ -31,57 +31,58 @@ def apply_nms(
 def rotated_nms(
     boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, iou: float, across_classes: bool = False
 ) -> np.ndarray:
-    """Return the indices (M,) int64 of the boxes that remain after NMS, best score first.
+    """Return the indices (M,) int64 of the boxes that remain after NMS, highest score first.
 
-    A box is dropped if its bird's-eye-view IoU with a remaining box of higher score and the same
-    label is above `iou`. Equal scores keep their order.
+    A box is dropped if its bird's-eye-view IoU with a remaining box of the same label and a higher
+    score is above `iou`. Boxes with equal scores keep their order.
 
     Args:
         boxes: (N, 7).
         scores: (N,).
         labels: (N,) int.
-        across_classes: boxes of different labels suppress each other too.
+        across_classes: boxes with different labels suppress each other too.
     """
     order = np.argsort(-scores, kind="stable")
     group = np.zeros(len(order), np.int64) if across_classes else np.asarray(labels)[order]
     ordered = np.asarray(boxes, np.float64).reshape(-1, 7)[order]
-    return order[_is_kept(ordered, group, iou, np.argsort(ordered[:, 0]))]
+    return order[_select_best(ordered, group, iou, np.argsort(ordered[:, 0]))]
 
 
 @njit(cache=True, nogil=True)
-def _is_kept(boxes, group, iou, by_x):
-    kept = np.ones(len(boxes), np.bool_)
-    radii, work = footprint_radii(boxes), np.empty((4, MAX_CORNERS))
+def _select_best(boxes, group, iou, x_order):
+    """Return a mask (N,) bool of the boxes that remain; boxes are sorted by score."""
+    keep = np.ones(len(boxes), np.bool_)
+    radii, corner_buffer = footprint_radii(boxes), np.empty((4, MAX_CORNERS))
     area = boxes[:, 3] * boxes[:, 4]
-    x, max_radius = boxes[by_x, 0], 0.0
+    x, max_radius = boxes[x_order, 0], 0.0
     for r in radii:
         if r > max_radius:  # False for NaN, the radius of boxes that overlap nothing
             max_radius = r
     for i in range(len(boxes)):
-        if not kept[i] or not radii[i] > 0:
+        if not keep[i] or not radii[i] > 0:
             continue
         max_distance = radii[i] + max_radius
         for position in range(lower_bound(x, boxes[i, 0] - max_distance), len(x)):
             if x[position] > boxes[i, 0] + max_distance:
                 break
-            j = by_x[position]
-            if j > i and kept[j] and group[i] == group[j]:
-                overlap = overlap_area(boxes[i], boxes[j], radii[i] + radii[j], work)
-                kept[j] = overlap <= 0 or overlap / (area[i] + area[j] - overlap) <= iou
-    return kept
+            j = x_order[position]
+            if j > i and keep[j] and group[i] == group[j]:
+                overlap = overlap_area(boxes[i], boxes[j], radii[i] + radii[j], corner_buffer)
+                keep[j] = overlap <= 0 or overlap / (area[i] + area[j] - overlap) <= iou
+    return keep
 
 
 @njit(cache=True, nogil=True)
 def keep_first(is_duplicate):
-    """Return which of N items to keep, (N,) bool.
+    """Return a mask (N,) bool that keeps the first of each set of duplicates.
 
     Args:
-        is_duplicate: (N, N) bool; item j is dropped if is_duplicate[i, j] for an earlier kept i.
+        is_duplicate: (N, N) bool; item j is dropped if is_duplicate[i, j] for a kept i < j.
     """
-    kept = np.ones(len(is_duplicate), np.bool_)
+    keep = np.ones(len(is_duplicate), np.bool_)
     for i in range(len(is_duplicate)):
-        if kept[i]:
+        if keep[i]:
             for j in range(i + 1, len(is_duplicate)):
                 if is_duplicate[i, j]:
-                    kept[j] = False
-    return kept
+                    keep[j] = False
+    return keep

@@ -14,8 +14,8 @@ from lidar_perception.ground.surface import GroundSurface
 from lidar_perception.intensity import MIN_POINTS, normalize_intensity
 from lidar_perception.types import SENSOR_HEIGHT, Detections, PointCloud
 
-MAX_MAST_M = 1.0  # maximum gap between the ego vehicle and the sensor on top of it
-MAX_ROOF_GAP_M = 1.0  # maximum horizontal gap to the ego vehicle; the next lane is farther away
+MAX_MAST_M = 1.0  # maximum vertical gap between the ego vehicle and a sensor above it
+MAX_ROOF_GAP_M = 1.0  # maximum horizontal gap to the ego vehicle's roof; cars in other lanes are farther away
 
 Corner = tuple[float, float, float]  # corner of a range: x, y, z in metres
 
@@ -25,9 +25,9 @@ class NormalizedView:
     """A cloud as a level sensor SENSOR_HEIGHT above the ground would have measured it.
 
     Attributes:
-        frame: the M points in the view, with intensity from normalize_intensity(), which is None
-            if the cloud has no usable intensity.
-        indices: (M,) int64 of these points in `source`.
+        frame: the M points in the view. Their intensity is normalized, or None if the cloud has no
+            usable intensity.
+        indices: (M,) int64 indices of these points in `source`.
         source: the original cloud of N points in sensor coordinates.
         pose: mounting pose of the sensor.
         use_intensity: False if the view ignores the intensity.
@@ -52,8 +52,8 @@ class NormalizedView:
         Args:
             low, high: range of the view, low <= x y z < high; other points and points with NaN are
                 dropped. None: all points are kept.
-            use_intensity: False sets the intensity to None. Zeros would change the results of
-                Patchwork++, which removes dark points below the ground as reflections.
+            use_intensity: False sets the intensity to None. (Zeros would change the results of
+                Patchwork++, which removes dark points below the ground as reflections.)
         """
         shift = np.array([0, 0, pose.height - SENSOR_HEIGHT], np.float32)
         xyz, indices, frame = level_points(source.xyz, pose), np.arange(len(source)), source
@@ -81,14 +81,14 @@ class NormalizedView:
         return replace(self, frame=replace(self.frame, xyz=xyz))
 
     def take(self, column: np.ndarray | None) -> np.ndarray | None:
-        """Select the values (M,) of this view from a column (N,) of the source; return None for None."""
+        """Return the values (M,) of this view from a column (N,) of the source; None for None."""
         return None if column is None else column.take(self.indices)
 
-    def convert(self, column: np.ndarray | None, other: NormalizedView) -> np.ndarray | None:
-        """Convert a column (M,) of this view to another view of the same source, with K points.
+    def transfer(self, column: np.ndarray | None, other: NormalizedView) -> np.ndarray | None:
+        """Transfer a column (M,) of this view to another view of the same source with K points.
 
         Returns:
-            (K,), 0 for points that are not in this view; None for None.
+            (K,) values, 0 for points that are not in this view; None for None.
         """
         if column is None:
             return None
@@ -97,7 +97,7 @@ class NormalizedView:
         return values.take(other.indices)
 
     def find_intensity_problem(self) -> str | None:
-        """Describe why the intensity is unusable; None if it is usable or the view ignores it."""
+        """Return the reason why the intensity is unusable; None if it is usable or ignored."""
         intensity = self.source.intensity
         if (
             not self.use_intensity
@@ -113,16 +113,17 @@ class NormalizedView:
             else "has the same intensity nearly everywhere"
         )
         return (
-            f"the cloud {defect}, so fewer people are found; set use_intensity to false if the sensor has no intensity"
+            f"the cloud {defect}, so fewer people are detected; set use_intensity to false if the sensor has no "
+            "intensity"
         )
 
 
 def _find_indices_in_range(xyz: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore"):
-        inside = np.ones(len(xyz), bool)
+        in_range = np.ones(len(xyz), bool)
         for axis in range(3):
-            inside &= (xyz[:, axis] >= low[axis]) & (xyz[:, axis] < high[axis])
-    return np.flatnonzero(inside)
+            in_range &= (xyz[:, axis] >= low[axis]) & (xyz[:, axis] < high[axis])
+    return np.flatnonzero(in_range)
 
 
 def crop_to_range(frame: PointCloud, low: Corner, high: Corner) -> tuple[np.ndarray, PointCloud]:
@@ -132,7 +133,7 @@ def crop_to_range(frame: PointCloud, low: Corner, high: Corner) -> tuple[np.ndar
 
 
 def segment_view_ground(frame: PointCloud, params: GroundParams) -> np.ndarray:
-    """Segment the ground of the frame of a NormalizedView, (M,) bool; ignores the pose in `params`."""
+    """Return the ground mask (M,) bool of a NormalizedView's frame; the pose in `params` is ignored."""
     return segment_ground(frame, replace(params, sensor_pose=SensorPoseParams()))
 
 
@@ -142,7 +143,7 @@ def restore_detections(detections: Detections, pose: SensorPoseParams) -> Detect
 
 
 def to_sensor_frame(detections: Detections, pose: SensorPoseParams) -> Detections:
-    """Transform detections of a NormalizedView to the coordinates of a sensor with this pose."""
+    """Transform detections of a NormalizedView to sensor coordinates."""
     boxes = detections.boxes.copy()
     boxes[:, 2] -= pose.height - SENSOR_HEIGHT
     if pose.roll or pose.pitch:
@@ -156,9 +157,9 @@ def to_sensor_frame(detections: Detections, pose: SensorPoseParams) -> Detection
 def drop_ego_vehicle(detections: Detections, height: float) -> Detections:
     """Remove detections of the ego vehicle, in the coordinates of a NormalizedView.
 
-    Boxes that contain the sensor, or are less than MAX_MAST_M above or below it, are removed. The roof
-    is only partly visible, so cars below the sensor at a horizontal distance of less than
-    MAX_ROOF_GAP_M are removed too.
+    Boxes are removed if they contain the sensor or are less than MAX_MAST_M above or below it. The
+    ego vehicle's roof is only partly visible, so cars below the sensor are also removed if they are
+    less than MAX_ROOF_GAP_M away horizontally.
 
     Args:
         height: actual height of the sensor above the ground in metres.

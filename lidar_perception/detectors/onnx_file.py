@@ -1,4 +1,4 @@
-"""Exported networks: ONNX files with the header of the checkpoint as metadata."""
+"""Exported networks: ONNX files that contain the checkpoint's header as metadata."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ def write_onnx(
     """Export a network, in eval mode, to an ONNX file.
 
     Args:
-        inputs: Example of each input, by name, in the order of the network's arguments.
-        outputs: Names of the outputs.
-        dynamic: Dimensions of each input that vary, see torch.export.
+        inputs: example of each input, by name, in the order of the network's arguments.
+        outputs: names of the outputs.
+        dynamic: dimensions of each input that vary, see torch.export.
 
     Raises:
-        InputError: the packages of the extra [onnx] are not installed.
+        InputError: onnx or onnxscript is not installed.
     """
     try:
         import onnx
         import onnxscript  # noqa: F401
     except ImportError:
         raise InputError(
-            "export onnx needs the packages of the extra [onnx]: pip install 'lidar_perception[onnx]'"
+            "export onnx requires the packages onnx and onnxscript: pip install 'lidar_perception[onnx]'"
         ) from None
     import torch
 
@@ -71,7 +71,7 @@ def open_session(path: str | Path) -> tuple[Any, str | None]:
     """Open an exported network in ONNX Runtime, on the CPU.
 
     Returns:
-        The session and the text of the header, None if it is missing.
+        The session, and the text of the header, or None if it is missing.
 
     Raises:
         InputError: onnxruntime is not installed, or the file is missing or invalid.
@@ -79,36 +79,47 @@ def open_session(path: str | Path) -> tuple[Any, str | None]:
     try:
         import onnxruntime
     except ImportError:
-        raise InputError(f"{path} needs onnxruntime: pip install 'lidar_perception[onnx]'") from None
+        raise InputError(f"{path} requires onnxruntime: pip install 'lidar_perception[onnx]'") from None
     if not Path(path).is_file():
-        raise InputError(f"there is no exported network {path}")
+        raise InputError(f"exported network not found: {path}")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = get_thread_count()
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         return session, session.get_modelmeta().custom_metadata_map.get(KEY)
-    except Exception as error:  # onnx exceptions share no base class
+    except Exception as error:  # ONNX Runtime's exceptions share no base class
         reason = str(error).splitlines()[0]
         raise InputError(f"ONNX Runtime cannot read {path}: {reason}") from None
 
 
 def run_session(session: Any, source: str, outputs: Sequence[str], inputs: Mapping[str, Any]) -> list[Any]:
-    """Run a session and return its outputs. InputError with the file name `source` if it fails."""
+    """Run a session and return its outputs.
+
+    Args:
+        source: name of the file, for messages.
+
+    Raises:
+        InputError: the session fails.
+    """
     try:
         return session.run(list(outputs), dict(inputs))
-    except Exception as error:  # onnx exceptions share no base class
+    except Exception as error:  # ONNX Runtime's exceptions share no base class
         raise InputError(f"ONNX Runtime cannot run {source}: {str(error).splitlines()[0]}") from None
 
 
 def read_exported_header(path: Path) -> Header:
-    """Read the header of an exported file. InputError if it is missing or invalid."""
+    """Read the header of an exported file.
+
+    Raises:
+        InputError: see open_session, or the header is missing or invalid.
+    """
     return Header.from_json(open_session(path)[1], str(path))
 
 
 def read_exported_name(path: Path) -> str:
-    """Return the key in checkpoint.NETWORKS of an exported file.
+    """Return the key in checkpoint.NETWORKS of an exported network.
 
-    Without a valid header this is PointPillars, whose loader then reports the error.
+    It is PointPillars if the header is invalid; the loader of PointPillars then reports the error.
     """
     with suppress(InputError):
         return read_exported_header(path).network

@@ -1,5 +1,4 @@
-"""Open a detector by its name or from a file of weights. Importing this module does not import
-torch; opening a detector does."""
+"""Opening of detectors, by name or from a file of weights. Importing this module does not import torch."""
 
 from __future__ import annotations
 
@@ -27,9 +26,8 @@ if TYPE_CHECKING:
 
 POINTPILLARS, POINTNET = "pointpillars", "pointnet"
 
-# Each detector's function load(path, device) in this folder. An empty path means the shipped
-# weights. A new detector is one line here. If it has an entry in PARAMS, the parameters of its
-# node, its function gets them as a third argument.
+# Each detector's function load(path, device) in this folder. An empty path selects the shipped
+# weights. Detectors with an entry in PARAMS get these parameters as a third argument.
 LOAD = {
     POINTPILLARS: "pointpillars.detector.load_detector",
     POINTNET: "pointnet.detector.load_pointnet_detector",
@@ -41,7 +39,7 @@ PARAMS = {
     FUSED: "fused.params.FusedDetectorParams",
 }
 ONNX = ".onnx"
-DETECTOR_BY_SUFFIX = {ONNX: POINTPILLARS, ".json": FUSED}  # suffixes of files other than checkpoints
+DETECTOR_BY_SUFFIX = {ONNX: POINTPILLARS, ".json": FUSED}  # suffixes of weight files that are not checkpoints
 
 
 class ConfigurableDetector(Detector, Protocol):
@@ -50,10 +48,10 @@ class ConfigurableDetector(Detector, Protocol):
     params: Any
 
     def with_params(self, params: Any) -> Self:
-        """Return a copy of this detector with other parameters."""
+        """Return a copy of this detector with different parameters."""
 
     def with_range(self, range: str) -> Self:
-        """Return a copy of this detector with another range, see base.NetworkDetector."""
+        """Return a copy of this detector with a different range, see base.NetworkDetector."""
 
 
 @report_compilation(whole_detector=True)
@@ -68,8 +66,8 @@ def open_detector(
 ) -> ConfigurableDetector:
     """Open a detector by its name or from a file of weights.
 
-    The first call on a machine compiles Numba functions for a minute or two and reports this on
-    standard error.
+    The first call on a machine compiles Numba functions, which takes a minute or two and is
+    reported on standard error.
 
     Args:
         weights: name of a detector (fused, pointpillars or pointnet) with its shipped weights; or
@@ -77,8 +75,8 @@ def open_detector(
             `train fused` (.json).
         device: auto, cpu, cuda or cuda:N.
         sensor_height: height of the sensor above the ground in metres; None: 1.73 m, as in KITTI.
-        min_score: threshold of every class, 0..1; None: the defaults.
-        range: ahead, around, or auto (the range of the training).
+        min_score: score threshold of all classes, 0..1; None: the defaults.
+        range: ahead, around, or auto (the range the network was trained for).
         settings: other parameters by their dotted names, such as {"fused.scores.car": 0.7}. They
             take precedence over the arguments above.
 
@@ -88,28 +86,28 @@ def open_detector(
     """
     if range not in RANGE_CHOICES:
         raise make_unknown_name_error("range", range, RANGE_CHOICES)
-    kind, path = resolve_weights(weights)
-    reference = None if kind in LOAD else find_reference(kind)
-    arguments = {} if device == "auto" else {f"{kind}.device": device}
-    if range != "auto" and kind != POINTNET:
-        arguments[f"{kind}.range"] = range
-    if path is not None and f"{kind}.weights" in settings:
-        raise InputError(f"both {kind}.weights and {path} are given; give one of them")
+    name, path = resolve_weights(weights)
+    reference = None if name in LOAD else find_reference(name)
+    arguments = {} if device == "auto" else {f"{name}.device": device}
+    if range != "auto" and name != POINTNET:
+        arguments[f"{name}.range"] = range
+    if path is not None and f"{name}.weights" in settings:
+        raise InputError(f"both {name}.weights and {path} are given; give only one of them")
     try:
         if reference is not None:
-            custom = (
+            custom_params = (
                 CustomDetectorParams()
                 if sensor_height is None
                 else set_sensor_height(CustomDetectorParams(), sensor_height)
             )
-            detector: Any = load_custom_detector(reference, device, range, custom)
-        elif kind in PARAMS:
-            weights_param = settings.get("pointnet.weights") if kind == POINTNET else None
-            params = with_values(default_params(weights_param or weights), {**arguments, **settings})
-            detector = _find_loader(kind)(path or "", getattr(params, kind).device, params)
+            detector: Any = load_custom_detector(reference, device, range, custom_params)
+        elif name in PARAMS:
+            weights_param = settings.get("pointnet.weights") if name == POINTNET else None
+            params = with_values(make_default_params(weights_param or weights), {**arguments, **settings})
+            detector = _find_loader(name)(path or "", getattr(params, name).device, params)
         else:
-            detector = _find_loader(kind)(path or "", device)
-        if reference is None and range != "auto" and f"{kind}.range" not in settings:
+            detector = _find_loader(name)(path or "", device)
+        if reference is None and range != "auto" and f"{name}.range" not in settings:
             detector = detector.with_range(range)
         if sensor_height is not None:
             detector = detector.with_sensor_height(sensor_height)
@@ -122,31 +120,32 @@ def open_detector(
     return detector
 
 
-def default_params(weights: str | Path) -> Any:
-    """Return the default parameters of a detector, a dataclass of groups.
+def make_default_params(weights: str | Path) -> Any:
+    """Make the default parameters of a detector, a dataclass of groups.
+
+    PointNet gets the ground and clustering parameters that it was trained with.
 
     Args:
-        weights: name of a detector, or file of its weights. PointNet gets the ground and clustering
-            parameters of its training.
+        weights: name of a detector, or file of its weights.
 
     Raises:
         InputError: there is no such detector or file.
     """
-    kind, path = resolve_weights(weights)
-    if kind not in LOAD:
+    name, path = resolve_weights(weights)
+    if name not in LOAD:
         return CustomDetectorParams()
-    if kind not in PARAMS:
+    if name not in PARAMS:
         return open_detector(weights).params
-    params = _import_attribute(PARAMS[kind])()
-    return _apply_training_params(params, path) if kind == POINTNET else params
+    params = _import_attribute(PARAMS[name])()
+    return _apply_training_params(params, path) if name == POINTNET else params
 
 
-def _find_loader(kind: str) -> Callable[..., ConfigurableDetector]:
-    return _import_attribute(LOAD[kind])
+def _find_loader(name: str) -> Callable[..., ConfigurableDetector]:
+    return _import_attribute(LOAD[name])
 
 
 def _import_attribute(path: str) -> Any:
-    """Return the attribute `module.name` of a module in this folder."""
+    """Import `module.attribute` from this folder."""
     return getattr(importlib.import_module(_get_module_name(path)), path.rpartition(".")[2])
 
 
@@ -174,9 +173,12 @@ def _apply_training_params(params: Any, path: Path | None) -> Any:
 
 
 def resolve_weights(weights: str | Path) -> tuple[str, Path | None]:
-    """Resolve a detector name, custom class or file to a detector name and the file of its weights.
+    """Return the detector's name and the file of its weights.
 
     The file is None for shipped weights and for custom detectors.
+
+    Args:
+        weights: detector name, custom class or file.
 
     Raises:
         InputError: `weights` is not a detector, a class or a file of weights.
@@ -186,11 +188,11 @@ def resolve_weights(weights: str | Path) -> tuple[str, Path | None]:
         return name, None
     if path.name == name and not path.suffix and not path.exists():
         raise make_unknown_name_error("detector or file of weights", name, [*LOAD, *entry_point_names()])
-    return find_kind(path), path
+    return _find_detector_name(path), path
 
 
-def find_kind(path: Path) -> str:
-    """Return the key in LOAD for a file of weights. InputError if the file is not valid."""
+def _find_detector_name(path: Path) -> str:
+    """Return the key in LOAD for a file of weights; raise InputError if the file is invalid."""
     if path.suffix == ONNX and path.is_file():
         from lidar_perception.detectors.onnx_file import read_exported_name
 
@@ -205,8 +207,8 @@ def find_kind(path: Path) -> str:
 def check_weights(path: Path, height: float) -> list[str]:
     """Return warnings about a file of weights, for a sensor `height` metres above the ground.
 
-    The warnings are about another sensor height in training, uncalibrated scores, and classes that
-    are never detected. Exported networks are not checked.
+    The warnings concern a different sensor height in training, uncalibrated scores, and classes
+    that are never detected. Exported networks are not checked.
     """
     if DETECTOR_BY_SUFFIX.get(path.suffix) == FUSED:
         from lidar_perception.detectors.fused.fusion import read_fusion
@@ -233,7 +235,7 @@ def _read_header(path: Path) -> Header | None:
 
 @dataclass(frozen=True)
 class DetectorChoice:
-    """Arguments of open_detector for a detector to open later, such as in a worker process."""
+    """Arguments of open_detector, for opening the detector later, for example in a worker process."""
 
     weights: str = FUSED
     range: str = "auto"
@@ -242,7 +244,7 @@ class DetectorChoice:
 
     @property
     def later_imports(self) -> tuple[str, ...]:
-        """Modules that open() imports; preload them before forking, since importing torch is slow."""
+        """Modules that open() imports, to be preloaded before forking because importing torch is slow."""
         loader = LOAD.get(resolve_weights(self.weights)[0])
         return () if loader is None else (_get_module_name(loader),)
 

@@ -9,11 +9,11 @@ from itertools import pairwise
 
 from lidar_perception.runs.threads import get_thread_count
 
-PARTS_PER_THREAD = 4  # small parts balance the load between threads
+PARTS_PER_THREAD = 4  # several small parts balance the load between threads
 
 
 def run_in_parts(compute: Callable[[int, int], None], count: int, max_parts: int) -> None:
-    """Call compute(begin, end) for parts of the range 0 .. count on get_thread_count() threads.
+    """Split range(count) into parts and call compute(begin, end) for each, on get_thread_count() threads.
 
     Args:
         compute: function that releases the GIL.
@@ -30,11 +30,11 @@ def run_in_parts(compute: Callable[[int, int], None], count: int, max_parts: int
         for begin, end in queue:
             compute(begin, end)
 
-    helpers = [_get_pool(threads - 1).submit(work) for _ in range(threads - 1)]
+    futures = [_get_pool(threads - 1).submit(work) for _ in range(threads - 1)]
     work()
-    for helper in helpers:
-        if not helper.cancel():  # False if it has already started
-            helper.result()
+    for future in futures:
+        if not future.cancel():  # False if it has already started
+            future.result()
 
 
 @cache

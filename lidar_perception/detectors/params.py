@@ -1,4 +1,4 @@
-"""Parameters that all detectors with networks have."""
+"""Parameters that all detectors with networks share."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 from lidar_perception.param_fields import Params, param
 from lidar_perception.types import CLASSES, Detections
 
-MIN_SCORE = 0.001  # low threshold for the average precision, which needs weak boxes too
+MIN_SCORE = 0.001  # threshold for computing average precision, which also needs boxes with low scores
 RANGE_CHOICES = "auto", "ahead", "around"
 
 
 @dataclass(frozen=True)
 class ScoreParams(Params):
-    """Minimum score of a detection, by class: a probability, see calibration.py."""
+    """Minimum score of a detection by class. Scores are probabilities, see calibration.py."""
 
     car: float = param(0.4, "Minimum score of a Car.", low=0.0, high=1.0)
     pedestrian: float = param(0.4, "Minimum score of a Pedestrian.", low=0.0, high=1.0)
@@ -26,11 +26,11 @@ class ScoreParams(Params):
 
     @staticmethod
     def for_all_classes(score: float) -> ScoreParams:
-        """Make parameters with one threshold for all classes."""
+        """Make parameters with the same threshold for all classes."""
         return ScoreParams(score, score, score, score)
 
-    def with_maximum(self, score: float) -> ScoreParams:
-        """Return these thresholds, limited to `score`."""
+    def limit_to(self, score: float) -> ScoreParams:
+        """Return these thresholds, each at most `score`."""
         return ScoreParams(*(min(value, score) for value in vars(self).values()))
 
     def get(self, name: str) -> float:
@@ -42,14 +42,14 @@ class ScoreParams(Params):
         return {name: self.get(name) for name in names}
 
     def passes(self, detections: Detections) -> np.ndarray:
-        """Return (K,) bool, True for detections that reach the threshold of their class."""
+        """Return a mask (K,) bool of the detections that reach the threshold of their class."""
         min_scores = np.array([self.get(name) for name in CLASSES], np.float32)
         return detections.scores >= min_scores[detections.class_ids]
 
 
 @dataclass(frozen=True)
 class NmsParams(Params):
-    """Non-maximum suppression: keep the best of boxes that overlap in the bird's-eye view."""
+    """Non-maximum suppression: of boxes that overlap in the bird's-eye view, keep the best one."""
 
     iou: float = param(0.1, "Drop a box if its bird's-eye-view IoU with a better one is above this.", low=0.0, high=1.0)
     across_classes: bool = param(False, "Boxes of different classes suppress each other too.")
@@ -85,7 +85,7 @@ def make_engine_param(more: str = "") -> Any:
     """Return the parameter `engine` of detectors with PointPillars.
 
     Args:
-        more: sentence about another network of the detector, appended to the description.
+        more: text about other networks of the detector, appended to the description.
     """
     return param(
         "auto",
@@ -99,7 +99,7 @@ def make_engine_param(more: str = "") -> Any:
 
 
 def make_on_points_param() -> Any:
-    """Return the parameter `on_points` of detectors that align cars with their points."""
+    """Return the parameter `on_points` of detectors that move the boxes of cars to their points."""
     return param(
         0.75,
         "Align the visible faces of cars with their points. 0: keep the box, 1: move it all the way.",
@@ -110,7 +110,7 @@ def make_on_points_param() -> Any:
 
 @dataclass(frozen=True)
 class NetworkParams(Params):
-    """Device of a detector's network, and thresholds of its detections."""
+    """Device of a detector's network, and thresholds for its detections."""
 
     weights: str = param("", "Checkpoint (.safetensors); empty: the shipped one.", fixed=True)
     device: str = param("auto", "cpu, cuda or cuda:N; auto: CUDA if available.", fixed=True)

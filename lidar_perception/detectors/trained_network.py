@@ -1,4 +1,4 @@
-"""A trained network on a device, with the CPU as a fallback."""
+"""Base class of trained networks that run on a device and fall back to the CPU."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Result = TypeVar("Result")
 
 
 class Movable(Protocol):
-    """A network that can move to another device."""
+    """A network that can be moved to another device."""
 
     def to(self, device: str) -> Any: ...
 
@@ -36,9 +36,9 @@ class Placement:
 
 
 class TrainedNetwork:
-    """Base class of networks in inference mode, with header and device."""
+    """A network in inference mode with its header and device."""
 
-    def __init__(self, network: Movable, header: Header, device: str):
+    def __init__(self, network: Movable, header: Header, device: str = CPU):
         self.network, self.header = network, header
         self.placement = Placement(device)
 
@@ -49,7 +49,7 @@ class TrainedNetwork:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of the classes that the network was trained to detect."""
+        """Names of the detectable classes."""
         return self.config.classes
 
     @property
@@ -66,14 +66,14 @@ class TrainedNetwork:
         return other
 
     def to_raw_scores(self, scores: Mapping[str, float]) -> list[float]:
-        """Convert calibrated scores by class to raw network scores, in the order of `classes`."""
+        """Convert calibrated scores by class to a list of raw network scores in the order of `classes`."""
         return [to_raw_score(name, scores[name], self.header.calibration) for name in self.classes]
 
     def move(self, device: str, cpu_fallback: bool = True) -> None:
-        """Move to another device, or to the CPU if the device is out of memory.
+        """Move the network to a device, or to the CPU if the device is out of memory.
 
         Raises:
-            InputError: the device is out of memory, and `cpu_fallback` is False.
+            InputError: the device is out of memory and `cpu_fallback` is False.
         """
         self.placement.device = device
         try:
@@ -81,20 +81,20 @@ class TrainedNetwork:
         except RuntimeError as error:
             self._fall_back(error, cpu_fallback)
 
-    def run(self, work: Callable[[], Result], cpu_fallback: bool = True) -> Result:
-        """Return work(); repeat it on the CPU if the device is out of memory.
+    def run(self, compute: Callable[[], Result], cpu_fallback: bool = True) -> Result:
+        """Return compute(); run it again on the CPU if the device is out of memory.
 
         Raises:
-            InputError: the device is out of memory, and `cpu_fallback` is False.
+            InputError: the device is out of memory and `cpu_fallback` is False.
         """
         try:
-            return work()
+            return compute()
         except RuntimeError as error:
             self._fall_back(error, cpu_fallback)
-            return work()
+            return compute()
 
     def _fall_back(self, error: RuntimeError, cpu_fallback: bool) -> None:
-        """Move to the CPU if the device is out of memory; raise any other error again."""
+        """Move the network to the CPU if the device is out of memory; re-raise any other error."""
         if not is_out_of_memory(error):
             raise error
         if self.device == CPU or not cpu_fallback:
@@ -104,8 +104,8 @@ class TrainedNetwork:
         )
         self.move(CPU)
 
-    def now(self) -> float:
-        """Return the time in seconds after all queued work on the device is done."""
+    def get_time(self) -> float:
+        """Wait for all queued work on the device and return the time in seconds."""
         if self.device.startswith("cuda"):
             import torch
 
@@ -113,7 +113,7 @@ class TrainedNetwork:
         return perf_counter()
 
     def find_best_scores(self, scores: Iterable[float]) -> tuple[dict[str, float], str | None]:
-        """Return the highest scores by class, and a problem if one of them is NaN.
+        """Return the highest score of each class by name, and a problem if one of them is NaN.
 
         Used for clouds without detections.
         """

@@ -1,4 +1,4 @@
-"""Paths of the weights of PointPillars and PointNet, without importing torch."""
+"""Paths of the weights of PointPillars and PointNet. Importing this module does not import torch."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from lidar_perception.types import InputError
 
 POINTPILLARS_WEIGHTS = Path(__file__).parent / "pointpillars" / "weights"  # folder with one file per version and size
 POINTNET_WEIGHTS = Path(__file__).parent / "pointnet" / "weights" / "pointnet.safetensors"
-PROPOSER = "pointpillars_v4_compact_nine_sensors.safetensors"  # weights of fused, in POINTPILLARS_WEIGHTS
-JUDGE = "judge.safetensors"  # file name of the weights that classify boxes of other detectors, beside POINTNET_WEIGHTS
+PROPOSER = "pointpillars_v4_compact_nine_sensors.safetensors"  # proposer of fused, in POINTPILLARS_WEIGHTS
+CLASSIFIER = "judge.safetensors"  # classifier of fused, in the folder of POINTNET_WEIGHTS
 
 
 def require_weights(path: str, parameter: str) -> Path:
-    """Return the path of a file of weights. InputError that names `parameter` if it does not exist."""
+    """Return the path of a weights file; raise an InputError that names `parameter` if it does not exist."""
     if not Path(path).is_file():
-        raise InputError(f"there is no checkpoint {path}; set {parameter} to an existing file")
+        raise InputError(f"checkpoint not found: {path}; set {parameter} to an existing file")
     return Path(path)
 
 
@@ -36,20 +36,20 @@ def find_pointpillars_weights(params: PointPillarsParams) -> Path:
 
 
 def find_proposer_weights() -> Path:
-    """Return the PointPillars weights of `fused`, trained on nine sensors. InputError if missing."""
+    """Return the path of fused's PointPillars weights; raise InputError if they are missing."""
     return _require_shipped(POINTPILLARS_WEIGHTS / PROPOSER, "fused", "fused.weights")
 
 
 def find_pointnet_weights(params: PointNetParams) -> Path:
-    """Return `params.weights`, by default the shipped file. InputError if it does not exist."""
+    """Return `params.weights`, by default the shipped file; raise InputError if it does not exist."""
     if params.weights:
         return require_weights(params.weights, "pointnet.weights")
     return _require_shipped(POINTNET_WEIGHTS, "PointNet", "pointnet.weights")
 
 
-def find_judge_weights() -> Path:
-    """Return the weights trained to classify boxes of other detectors. InputError if missing."""
-    return _require_shipped(POINTNET_WEIGHTS.with_name(JUDGE), "fused", "fused.classifier")
+def find_classifier_weights() -> Path:
+    """Return the path of fused's PointNet weights; raise InputError if they are missing."""
+    return _require_shipped(POINTNET_WEIGHTS.with_name(CLASSIFIER), "fused", "fused.classifier")
 
 
 def _require_shipped(path: Path, user: str, parameter: str) -> Path:

@@ -135,7 +135,7 @@ class DetectorNode(ManagedNode):
         """Return params with lower score thresholds if a tracker uses the weak detections."""
         if self.results.tracks is None:
             return params
-        low = network_params.scores.with_maximum(self.node_params.tracking.min_score)
+        low = network_params.scores.limit_to(self.node_params.tracking.min_score)
         return replace(params, **{self.loader.group: replace(network_params, scores=low)})
 
     def _diagnose(self, frame: PointCloud, result: DetectionResult, params: Any, tracking_problem: str | None) -> None:

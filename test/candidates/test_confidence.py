@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from candidate_samples import from_pixels
 from hypothesis import given
 from hypothesis import strategies as st
 from samples import DATA, needs_data
@@ -30,7 +31,6 @@ from lidar_perception.candidates.silhouette import (
     WINDOW_WIDTH_M,
     compute_similarity,
     draw_silhouettes,
-    from_pixels,
     to_pixels,
 )
 from lidar_perception.data.open import open_recording
@@ -43,7 +43,7 @@ FLOOR = -1.7
 STEP = np.radians([METRIC.resolution.azimuth_step, METRIC.resolution.elevation_step])
 
 
-def board(distance, width=0.5, height=1.7, bearing=0.0, offset=0.3):
+def make_board(distance, width=0.5, height=1.7, bearing=0.0, offset=0.3):
     """Return points of an upright board at this distance, sampled with METRIC's resolution."""
     step = distance * STEP
     y = np.arange(-width / 2, width / 2, step[0])[:, None] + offset * step[0]
@@ -55,7 +55,7 @@ def board(distance, width=0.5, height=1.7, bearing=0.0, offset=0.3):
     return xyz[keep].astype(np.float32)
 
 
-def draw(xyz, params=METRIC, floor=FLOOR):
+def draw_silhouette(xyz, params=METRIC, floor=FLOOR):
     return draw_silhouettes(xyz, np.array([0, len(xyz)]), np.ones((1, 1)), np.array([floor]), params)[0]
 
 
@@ -69,7 +69,7 @@ def make_box(distance, width=0.5, height=1.7):
 @pytest.mark.parametrize("distance", [6.0, 15.0, 30.0])
 @pytest.mark.parametrize("width, height", [(0.5, 1.7), (0.9, 1.2), (1.2, 2.2)])
 def test_size_of_a_board_does_not_depend_on_range(distance, width, height):
-    pixels = to_pixels(draw(board(distance, width, height)))
+    pixels = to_pixels(draw_silhouette(make_board(distance, width, height)))
     rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
     cell = distance * STEP
     assert np.ptp(columns) + 1 == pytest.approx(width / WINDOW_WIDTH_M * COLUMNS, abs=2 + cell[0] * 20)
@@ -78,77 +78,85 @@ def test_size_of_a_board_does_not_depend_on_range(distance, width, height):
 
 
 def test_spreading_points_makes_silhouettes_independent_of_range():
-    near, far = board(7.0), board(26.0)
-    bare = PipelineParams()
-    assert compute_similarity(draw(far, bare)[None], draw(near, bare))[0] < 0.75
-    assert compute_similarity(draw(far)[None], draw(near))[0] > 0.9
+    near_board, far_board = make_board(7.0), make_board(26.0)
+    params = PipelineParams()
+    assert compute_similarity(draw_silhouette(far_board, params)[None], draw_silhouette(near_board, params))[0] < 0.75
+    assert compute_similarity(draw_silhouette(far_board)[None], draw_silhouette(near_board))[0] > 0.9
 
 
 @given(seeds)
 def test_a_metric_silhouette_moves_with_the_ground(seed):
     rng = np.random.default_rng(seed)
-    xyz = board(rng.uniform(5, 30), bearing=0.0) + rng.normal(0, 0.02, (1, 3)).astype(np.float32)
-    up = np.float32(rng.integers(-8, 8) / 4)  # exact in float32
-    moved = xyz + np.float32([0, 0, up])
-    shared = compute_similarity(draw(moved, floor=FLOOR + float(up))[None], draw(xyz))[0]
-    assert shared > 0.97
+    xyz = make_board(rng.uniform(5, 30), bearing=0.0) + rng.normal(0, 0.02, (1, 3)).astype(np.float32)
+    shift = np.float32(rng.integers(-8, 8) / 4)  # exact in float32
+    shifted_points = xyz + np.float32([0, 0, shift])
+    similarity = compute_similarity(
+        draw_silhouette(shifted_points, floor=FLOOR + float(shift))[None], draw_silhouette(xyz)
+    )[0]
+    assert similarity > 0.97
 
 
 def test_points_outside_the_window_are_not_drawn():
-    inside, tall = board(10.0), board(10.0, height=4.0)
-    assert to_pixels(draw(tall))[0].any()
-    above = tall[tall[:, 2] > FLOOR + WINDOW_HEIGHT_M + 0.2]
-    assert not draw(above).any()
-    both = draw(np.concatenate([inside, inside + np.float32([0, 0, 3.0])]))
-    np.testing.assert_array_equal(both, draw(inside))
+    low_board, tall_board = make_board(10.0), make_board(10.0, height=4.0)
+    assert to_pixels(draw_silhouette(tall_board))[0].any()
+    high_points = tall_board[tall_board[:, 2] > FLOOR + WINDOW_HEIGHT_M + 0.2]
+    assert not draw_silhouette(high_points).any()
+    image = draw_silhouette(np.concatenate([low_board, low_board + np.float32([0, 0, 3.0])]))
+    np.testing.assert_array_equal(image, draw_silhouette(low_board))
 
 
 @given(seeds, st.integers(0, 6))
 def test_shifts_return_the_best_score_of_the_shifted_images(seed, shifts):
     rng = np.random.default_rng(seed)
     pixels, template = (rng.random((ROWS, COLUMNS)) < 0.2 for _ in range(2))
-    best = 0.0
+    expected = 0.0
     for columns in range(-shifts, shifts + 1):
-        moved = np.zeros_like(pixels)
+        shifted = np.zeros_like(pixels)
         if columns >= 0:
-            moved[:, columns:] = pixels[:, : COLUMNS - columns]
+            shifted[:, columns:] = pixels[:, : COLUMNS - columns]
         else:
-            moved[:, :columns] = pixels[:, -columns:]
-        best = max(best, (moved & template).sum() / np.sqrt(pixels.sum() * template.sum()))
-    found = compute_similarity(from_pixels(pixels)[None], from_pixels(template), StmParams(shifts=shifts))
-    assert found[0] == pytest.approx(best, abs=1e-12)
+            shifted[:, :columns] = pixels[:, -columns:]
+        expected = max(expected, (shifted & template).sum() / np.sqrt(pixels.sum() * template.sum()))
+    similarity = compute_similarity(from_pixels(pixels)[None], from_pixels(template), StmParams(shifts=shifts))
+    assert similarity[0] == pytest.approx(expected, abs=1e-12)
 
 
 def test_seen_only_ignores_hidden_legs():
-    whole = board(12.0, width=0.4)
-    legs = whole[:, 2] < FLOOR + 0.8
-    head = whole[~legs]
-    seen = with_values(METRIC, {"stm.seen_only": True})
-    alike = [compute_similarity(draw(head)[None], draw(whole), params.stm)[0] for params in (METRIC, seen)]
-    assert alike[0] < 0.85 and alike[1] > 0.99
-    again = compute_similarity(draw(whole)[None], draw(head), seen.stm)[0]
-    assert again == pytest.approx(alike[1], abs=1e-12)  # symmetric in the hidden image
+    person = make_board(12.0, width=0.4)
+    is_leg = person[:, 2] < FLOOR + 0.8
+    upper_body = person[~is_leg]
+    seen_only_params = with_values(METRIC, {"stm.seen_only": True})
+    similarities = [
+        compute_similarity(draw_silhouette(upper_body)[None], draw_silhouette(person), params.stm)[0]
+        for params in (METRIC, seen_only_params)
+    ]
+    assert similarities[0] < 0.85 and similarities[1] > 0.99
+    reverse_similarity = compute_similarity(
+        draw_silhouette(person)[None], draw_silhouette(upper_body), seen_only_params.stm
+    )[0]
+    assert reverse_similarity == pytest.approx(similarities[1], abs=1e-12)  # symmetric in the hidden image
 
 
 def test_pca_axis_corrects_a_tilt_and_yaw_does_not():
     rng = np.random.default_rng(0)
-    upright = rng.normal(size=(600, 3)) * [0.05, 0.2, 0.6] + [10, 0, 0]
+    upright_points = rng.normal(size=(600, 3)) * [0.05, 0.2, 0.6] + [10, 0, 0]
     angle = 0.5
-    tilt = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
-    tilted = (upright - [10, 0, 0]) @ tilt.T + [10, 0, 0]
+    rotation = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    tilted_points = (upright_points - [10, 0, 0]) @ rotation.T + [10, 0, 0]
     images = {
         axis: [
-            draw(xyz.astype(np.float32), with_values(PipelineParams(), {"stm.axis": axis})) for xyz in (upright, tilted)
+            draw_silhouette(xyz.astype(np.float32), with_values(PipelineParams(), {"stm.axis": axis}))
+            for xyz in (upright_points, tilted_points)
         ]
         for axis in ("yaw", "pca")
     }
-    alike = {axis: compute_similarity(a[None], b)[0] for axis, (a, b) in images.items()}
-    assert alike["pca"] > 0.97 > 0.9 > alike["yaw"]
+    similarity = {axis: compute_similarity(a[None], b)[0] for axis, (a, b) in images.items()}
+    assert similarity["pca"] > 0.97 > 0.9 > similarity["yaw"]
 
 
 def test_every_dilation_adds_pixels():
-    xyz = board(15.0)
-    images = [to_pixels(draw(xyz, with_values(PipelineParams(), {"stm.dilations": n}))) for n in range(4)]
+    xyz = make_board(15.0)
+    images = [to_pixels(draw_silhouette(xyz, with_values(PipelineParams(), {"stm.dilations": n}))) for n in range(4)]
     for small, large in pairwise(images):
         assert (large[small]).all() and large.sum() >= small.sum()
 
@@ -156,13 +164,13 @@ def test_every_dilation_adds_pixels():
 # --- confidence ----------------------------------------------------------------------------
 
 
-def features_of(clusters, boxes):
+def compute_features(clusters, boxes):
     start = np.cumsum([0] + [len(c) for c in clusters])
     return compute_shape_features(np.concatenate(clusters), start, np.concatenate(boxes), BEST)
 
 
 def test_features_of_a_board_are_its_dimensions():
-    shape = {k: v[0] for k, v in features_of([board(12.0, 0.6, 1.7)], [make_box(12.0, 0.6)]).items()}
+    shape = {k: v[0] for k, v in compute_features([make_board(12.0, 0.6, 1.7)], [make_box(12.0, 0.6)]).items()}
     assert set(shape) == set(SHAPE_KNOTS)
     assert shape["range_m"] == pytest.approx(12.0, abs=0.05)
     assert shape["height_m"] == pytest.approx(1.7, abs=12 * STEP[1])
@@ -176,25 +184,25 @@ def test_features_of_a_board_are_its_dimensions():
 def test_features_do_not_depend_on_other_clusters(seed):
     rng = np.random.default_rng(seed)
     distances = rng.uniform(5, 40, 4)
-    clusters = [board(d, rng.uniform(0.3, 2), rng.uniform(0.5, 2.5)) for d in distances]
+    clusters = [make_board(d, rng.uniform(0.3, 2), rng.uniform(0.5, 2.5)) for d in distances]
     boxes = [make_box(d) for d in distances]
-    together = features_of(clusters, boxes)
+    features = compute_features(clusters, boxes)
     order = rng.permutation(4)
-    again = features_of([clusters[i] for i in order], [boxes[i] for i in order])
-    for name, values in together.items():
-        np.testing.assert_array_equal(again[name], values[order])
-    for extra in ((), (rng.random(4), rng.normal(0, 0.3, 4))):
-        likely = compute_confidence(together, *extra)
-        assert likely.shape == (4,) and ((likely > 0) & (likely < 1)).all()
+    permuted_features = compute_features([clusters[i] for i in order], [boxes[i] for i in order])
+    for name, values in features.items():
+        np.testing.assert_array_equal(permuted_features[name], values[order])
+    for seed_features in ((), (rng.random(4), rng.normal(0, 0.3, 4))):
+        confidence = compute_confidence(features, *seed_features)
+        assert confidence.shape == (4,) and ((confidence > 0) & (confidence < 1)).all()
 
 
 def test_no_clusters_give_empty_features():
-    none = compute_shape_features(np.zeros((0, 3), np.float32), np.array([0]), np.zeros((0, 7)), BEST)
-    assert all(v.shape == (0,) for v in none.values()) and compute_confidence(none).shape == (0,)
+    features = compute_shape_features(np.zeros((0, 3), np.float32), np.array([0]), np.zeros((0, 7)), BEST)
+    assert all(v.shape == (0,) for v in features.values()) and compute_confidence(features).shape == (0,)
 
 
 def test_a_single_point_has_finite_features():
-    shape = features_of([np.float32([[9, 0, -1]])], [make_box(9.0)])
+    shape = compute_features([np.float32([[9, 0, -1]])], [make_box(9.0)])
     assert all(np.isfinite(v).all() for v in shape.values()) and np.isfinite(compute_confidence(shape))[0]
 
 
@@ -206,38 +214,38 @@ def test_every_curve_exists_and_rises_with_similarity():
         for name, curve in model["curves"].items():
             assert tuple(curve["knots"]) == ({**SHAPE_KNOTS, **SEED_KNOTS})[name]
             assert len(curve["values"]) == len(curve["knots"])
-    alike = models["seed"]["curves"]["similarity"]["values"]
-    assert alike == sorted(alike) and alike[-1] > alike[0]
+    values = models["seed"]["curves"]["similarity"]["values"]
+    assert values == sorted(values) and values[-1] > values[0]
 
 
-def two_people():
+def make_two_people():
     """Return points of two similar people, the first row of each, and their boxes."""
-    xyz = np.concatenate([board(9.0), board(9.0, offset=0.7) + np.float32([0, 3, 0])])
-    first = len(board(9.0))
+    xyz = np.concatenate([make_board(9.0), make_board(9.0, offset=0.7) + np.float32([0, 3, 0])])
+    first = len(make_board(9.0))
     return xyz, np.array([0, first, len(xyz)]), np.concatenate([make_box(9.0), make_box(9.0)])
 
 
 def test_seed_cluster_is_found_by_the_seeds_points():
-    xyz, start, boxes = two_people()
+    xyz, start, boxes = make_two_people()
     seed = seed_from_points(xyz[: start[1]], boxes[0])
     assert find_seed_cluster(seed, xyz, start).tolist() == [True, False]
-    most = seed_from_points(xyz[: int(0.6 * start[1])], boxes[0])
-    assert find_seed_cluster(most, xyz, start).tolist() == [True, False]
-    elsewhere = seed_from_points(xyz[: start[1]] + np.float32(1e-3), boxes[0])
-    assert not find_seed_cluster(elsewhere, xyz, start).any()
+    partial_seed = seed_from_points(xyz[: int(0.6 * start[1])], boxes[0])
+    assert find_seed_cluster(partial_seed, xyz, start).tolist() == [True, False]
+    shifted_seed = seed_from_points(xyz[: start[1]] + np.float32(1e-3), boxes[0])
+    assert not find_seed_cluster(shifted_seed, xyz, start).any()
     assert find_seed_cluster(seed, np.zeros((0, 3), np.float32), np.array([0])).shape == (0,)
 
 
-@pytest.mark.parametrize("certain", [True, False])
-def test_seed_confidence_is_1_if_certain(certain):
-    xyz, start, boxes = two_people()
+@pytest.mark.parametrize("is_confirmed", [True, False])
+def test_confirmed_seed_has_confidence_1(is_confirmed):
+    xyz, start, boxes = make_two_people()
     boxes[1, 1] += 3.0
     ids = np.repeat(np.int32([1, 2]), np.diff(start))
     params = with_values(BEST, {"confidence.threshold": 0.0})
-    seed = seed_from_points(xyz[: start[1]], boxes[0], certain)
+    seed = seed_from_points(xyz[: start[1]], boxes[0], is_confirmed)
     scores = refine_clusters(xyz, ids, boxes, [seed], params).final.scores
     shape = compute_confidence(compute_shape_features(xyz, start, boxes, BEST))
-    assert scores[0] == pytest.approx(1.0 if certain else shape[0], abs=1e-6)
+    assert scores[0] == pytest.approx(1.0 if is_confirmed else shape[0], abs=1e-6)
     assert scores[1] == pytest.approx(
         refine_clusters(
             xyz, ids, boxes, [seed_from_points(xyz[: start[1]] + np.float32([0, 0.5, 0]), boxes[0])], params
@@ -250,7 +258,7 @@ def test_seed_confidence_is_1_if_certain(certain):
 
 
 def test_configuration_best_accepts_clusters_by_confidence():
-    people = [board(8.0), board(16.0), board(11.0, width=1.8)]
+    people = [make_board(8.0), make_board(16.0), make_board(11.0, width=1.8)]
     xyz = np.concatenate([p + np.float32([0, 6 * i - 6, 0]) for i, p in enumerate(people)])
     rng = np.random.default_rng(0)
     flat = np.column_stack([rng.uniform(2, 30, 6000), rng.uniform(-20, 20, 6000), np.full(6000, FLOOR)]).astype(
@@ -276,7 +284,7 @@ def test_automatic_seed_is_most_likely_cluster_or_template():
         PointCloud(
             np.concatenate(
                 [
-                    board(9.0, 0.55),
+                    make_board(9.0, 0.55),
                     np.float32([[x, y, FLOOR] for x in np.arange(3, 20, 0.4) for y in np.arange(-8, 8, 0.4)]),
                 ]
             )

@@ -22,7 +22,7 @@ from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.params import ViewParams
 
 
-def template():
+def make_template_source():
     return make_fixed_source(seed_from_points(person(7, 2).astype(np.float32), boxes_at([[7, 2]])[0]))
 
 
@@ -32,16 +32,16 @@ def template():
     ids=["empty", "one point", "one low point", "only ground"],
 )
 def test_clouds_without_objects_give_empty_results(xyz):
-    s, found = find_candidates(PointCloud(xyz.astype(np.float32)), template())
-    assert isinstance(s, SegmentedCloud)
-    assert s.indices.tolist() == list(range(len(xyz))) and s.xyz.shape == (len(xyz), 3)
-    assert s.ground.shape == (len(xyz),) and s.ground.dtype == bool
-    assert s.cluster_ids.shape == (len(xyz),) and s.cluster_ids.dtype == np.int32
-    assert s.boxes.shape == (0, 7) and s.boxes.dtype == np.float32
-    for stage in (found.stage1, found.stage2, found.final):
+    segmented, candidates = find_candidates(PointCloud(xyz.astype(np.float32)), make_template_source())
+    assert isinstance(segmented, SegmentedCloud)
+    assert segmented.indices.tolist() == list(range(len(xyz))) and segmented.xyz.shape == (len(xyz), 3)
+    assert segmented.ground.shape == (len(xyz),) and segmented.ground.dtype == bool
+    assert segmented.cluster_ids.shape == (len(xyz),) and segmented.cluster_ids.dtype == np.int32
+    assert segmented.boxes.shape == (0, 7) and segmented.boxes.dtype == np.float32
+    for stage in (candidates.stage1, candidates.stage2, candidates.final):
         assert stage.boxes.shape == (0, 7) and stage.boxes.dtype == np.float32
         assert stage.class_ids.shape == stage.scores.shape == (0,)
-    assert tuple(found.ms) == STEPS
+    assert tuple(candidates.ms) == STEPS
 
 
 def test_cloud_without_a_seed_raises_input_error():
@@ -56,7 +56,7 @@ WITH_VIEW = PipelineParams(view=ViewParams(enabled=True))
 
 def test_error_of_a_view_without_a_camera_names_the_remedy():
     with pytest.raises(InputError, match=r"view\.enabled"):
-        find_candidates(PointCloud(scene()), template(), params=WITH_VIEW)
+        find_candidates(PointCloud(scene()), make_template_source(), params=WITH_VIEW)
 
 
 def test_restricted_view_equals_pipeline_on_cropped_points():
@@ -65,15 +65,15 @@ def test_restricted_view_equals_pipeline_on_cropped_points():
     intrinsics = np.array([[600, 0, 500], [0, 600, 300], [0, 0, 1]])
     camera = Camera(np.column_stack([intrinsics @ axes, np.zeros(3)]), 1000, 600)
     xyz = scene()
-    inside = camera.in_view(xyz)
-    assert 0 < inside.sum() < len(xyz)
-    cropped, found = find_candidates(PointCloud(xyz), template(), camera, WITH_VIEW)
-    np.testing.assert_array_equal(cropped.indices, np.flatnonzero(inside))
-    alone, expected = find_candidates(PointCloud(xyz[inside]), template())
-    np.testing.assert_array_equal(cropped.xyz, alone.xyz)
-    np.testing.assert_array_equal(cropped.cluster_ids, alone.cluster_ids)
-    np.testing.assert_array_equal(found.final.boxes, expected.final.boxes)
-    empty, _ = find_candidates(PointCloud(np.zeros((0, 3), np.float32)), template(), camera, WITH_VIEW)
+    in_view = camera.in_view(xyz)
+    assert 0 < in_view.sum() < len(xyz)
+    segmented, candidates = find_candidates(PointCloud(xyz), make_template_source(), camera, WITH_VIEW)
+    np.testing.assert_array_equal(segmented.indices, np.flatnonzero(in_view))
+    expected_cloud, expected = find_candidates(PointCloud(xyz[in_view]), make_template_source())
+    np.testing.assert_array_equal(segmented.xyz, expected_cloud.xyz)
+    np.testing.assert_array_equal(segmented.cluster_ids, expected_cloud.cluster_ids)
+    np.testing.assert_array_equal(candidates.final.boxes, expected.final.boxes)
+    empty, _ = find_candidates(PointCloud(np.zeros((0, 3), np.float32)), make_template_source(), camera, WITH_VIEW)
     assert empty.xyz.shape == (0, 3)
 
 
@@ -81,12 +81,12 @@ def test_restricted_view_equals_pipeline_on_cropped_points():
 def test_the_order_of_the_points_does_not_matter(seed):
     xyz = scene()
     order = np.random.default_rng(seed).permutation(len(xyz))
-    s, found = find_candidates(PointCloud(xyz), template())
-    t, shuffled = find_candidates(PointCloud(xyz[order]), template())
-    np.testing.assert_array_equal(t.ground, s.ground[order])
-    np.testing.assert_array_equal(t.cluster_ids > 0, s.cluster_ids[order] > 0)
+    segmented, candidates = find_candidates(PointCloud(xyz), make_template_source())
+    shuffled_segmented, shuffled_candidates = find_candidates(PointCloud(xyz[order]), make_template_source())
+    np.testing.assert_array_equal(shuffled_segmented.ground, segmented.ground[order])
+    np.testing.assert_array_equal(shuffled_segmented.cluster_ids > 0, segmented.cluster_ids[order] > 0)
     for name in ("stage1", "stage2", "final"):
-        a, b = (getattr(c, name) for c in (found, shuffled))
+        a, b = (getattr(result, name) for result in (candidates, shuffled_candidates))
         assert len(a) == len(b) > 0
         i, j = np.lexsort(a.boxes.T), np.lexsort(b.boxes.T)
         np.testing.assert_allclose(a.boxes[i], b.boxes[j], rtol=0, atol=1e-5)
@@ -94,9 +94,9 @@ def test_the_order_of_the_points_does_not_matter(seed):
 
 
 def test_ground_points_have_no_cluster_and_ids_match_boxes():
-    s = segment_cloud(PointCloud(scene()))
-    assert not (s.ground & (s.cluster_ids > 0)).any()
-    assert np.unique(s.cluster_ids).tolist() == list(range(len(s.boxes) + 1))
+    segmented = segment_cloud(PointCloud(scene()))
+    assert not (segmented.ground & (segmented.cluster_ids > 0)).any()
+    assert np.unique(segmented.cluster_ids).tolist() == list(range(len(segmented.boxes) + 1))
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_ground_points_have_no_cluster_and_ids_match_boxes():
 @pytest.mark.parametrize("min_confidence", [0.0, 0.5])
 def test_the_automatic_seed_falls_back_to_the_template(xyz, min_confidence):
     params = with_values(PipelineParams(), {"seed.min_confidence": min_confidence, "clustering.dbscan.min_samples": 3})
-    given = seed_from_points(person(7, 2).astype(np.float32), boxes_at([[7, 2]])[0])
-    assert make_automatic_source([given], params)(segment_cloud(PointCloud(xyz.astype(np.float32)), params=params)) == (
-        given,
-    )
+    template_seed = seed_from_points(person(7, 2).astype(np.float32), boxes_at([[7, 2]])[0])
+    assert make_automatic_source([template_seed], params)(
+        segment_cloud(PointCloud(xyz.astype(np.float32)), params=params)
+    ) == (template_seed,)

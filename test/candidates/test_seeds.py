@@ -31,36 +31,36 @@ def test_seed_from_labels_is_the_nearest_pedestrian():
     xyz = scene()
     ground = xyz[:, 2] < GROUND_Z + 0.4  # includes the feet
     boxes = boxes_at(PEOPLE[[2, 0, 1]])
-    inside = points_in_box(xyz, boxes[1])
-    assert (inside & ground).any()
+    in_box = points_in_box(xyz, boxes[1])
+    assert (in_box & ground).any()
     seed = seed_from_truth(xyz, ground, boxes)
-    np.testing.assert_array_equal(seed.xyz, xyz[inside & ~ground])
+    np.testing.assert_array_equal(seed.xyz, xyz[in_box & ~ground])
     assert seed.height == 1.8 and seed.floor == pytest.approx(boxes[1, 2] - 0.9)
-    with_ground = seed_from_points(xyz[inside], boxes[1])
-    assert (with_ground.silhouette() != seed.silhouette()).any()
+    with_ground = seed_from_points(xyz[in_box], boxes[1])
+    assert (with_ground.draw_silhouette() != seed.draw_silhouette()).any()
 
 
 def test_seed_from_labels_needs_a_pedestrian_with_ten_points():
     xyz = person(6, 0, count=9).astype(np.float32)
-    none = np.zeros(9, bool)
+    no_ground = np.zeros(9, bool)
     with pytest.raises(InputError, match="no Pedestrian"):
-        seed_from_truth(xyz, none, np.zeros((0, 7)))
-    with pytest.raises(InputError, match="has 9 points"):
-        seed_from_truth(xyz, none, boxes_at([[6, 0]]))
-    more = np.concatenate([xyz, xyz[:1]])
-    assert seed_from_truth(more, np.zeros(10, bool), boxes_at([[6, 0]])).height == 1.8
-    with pytest.raises(InputError, match="has 0 points"):
-        seed_from_truth(more, np.ones(10, bool), boxes_at([[6, 0]]))
+        seed_from_truth(xyz, no_ground, np.zeros((0, 7)))
+    with pytest.raises(InputError, match="has only 9 points"):
+        seed_from_truth(xyz, no_ground, boxes_at([[6, 0]]))
+    ten_points = np.concatenate([xyz, xyz[:1]])
+    assert seed_from_truth(ten_points, np.zeros(10, bool), boxes_at([[6, 0]])).height == 1.8
+    with pytest.raises(InputError, match="has only 0 points"):
+        seed_from_truth(ten_points, np.ones(10, bool), boxes_at([[6, 0]]))
 
 
-def clicked_scene():
+def make_clicked_scene():
     xyz = np.concatenate([person(6, 0), person(8, 3, seed=1)]).astype(np.float32)
     labels = np.repeat(np.int32([1, 2]), 400)
     return xyz, labels, fit_boxes(xyz, labels, "axis_aligned")
 
 
 def test_seed_from_click_takes_the_nearest_cluster():
-    xyz, labels, boxes = clicked_scene()
+    xyz, labels, boxes = make_clicked_scene()
     for k, click in ((1, [6, 0.2, -1]), (2, [8.5, 3, 0]), (1, [6, 1.2, -1]), (2, [8, 1.8, -1])):
         seed = seed_from_click(np.array(click), xyz, labels, boxes, 2.0)
         np.testing.assert_array_equal(seed.xyz, xyz[labels == k])
@@ -69,7 +69,7 @@ def test_seed_from_click_takes_the_nearest_cluster():
 
 
 def test_seed_from_click_ignores_noise_points():
-    xyz, labels, boxes = clicked_scene()
+    xyz, labels, boxes = make_clicked_scene()
     xyz = np.concatenate([np.float32([[7, 1.5, -1]]), xyz])
     labels = np.concatenate([np.int32([0]), labels])
     with pytest.raises(InputError, match="nearest cluster is"):
@@ -77,7 +77,7 @@ def test_seed_from_click_ignores_noise_points():
 
 
 def test_seed_from_click_needs_a_cluster_within_the_radius():
-    xyz, labels, boxes = clicked_scene()
+    xyz, labels, boxes = make_clicked_scene()
     edge = np.array([xyz[:, 0].min() - 1.0, 0, -1])
     seed_from_click(edge, xyz, labels, boxes, 1.5)
     with pytest.raises(InputError, match=r"within 0\.9 m"):
@@ -89,7 +89,7 @@ def test_seed_from_click_needs_a_cluster_within_the_radius():
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])
 def test_click_that_is_far_away_or_not_finite_is_rejected(axis, value):
-    xyz, labels, boxes = clicked_scene()
+    xyz, labels, boxes = make_clicked_scene()
     click = np.array([6, 0.2, -1.0])
     click[axis] = value
     with pytest.raises(InputError, match=r"not finite|nearest cluster is inf"):
@@ -182,5 +182,5 @@ def test_error_of_an_unreadable_template_names_the_file(tmp_path):
 def test_the_packaged_template_is_a_pedestrian():
     seed = load_seed()
     assert 1.4 < seed.height < 2.1
-    pixels = to_pixels(seed.silhouette())
+    pixels = to_pixels(seed.draw_silhouette())
     assert pixels[0].any() and pixels[-1].any() and pixels[:, 0].any() and pixels[:, -1].any()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from candidate_samples import from_pixels
 from hypothesis import example, given
 from hypothesis import strategies as st
 from samples import DATA, needs_data
@@ -16,7 +17,6 @@ from lidar_perception.candidates.silhouette import (
     compute_cpa_scales,
     compute_similarity,
     draw_silhouettes,
-    from_pixels,
     to_pixels,
 )
 from lidar_perception.types import PointCloud
@@ -26,7 +26,7 @@ seeds = st.integers(0, 2**32 - 1)
 PLAIN = np.ones((1, 1))
 
 
-def silhouette(xyz, scales=(1.0,)):
+def draw_silhouette(xyz, scales=(1.0,)):
     return draw_silhouettes(xyz, np.array([0, len(xyz)]), np.array([scales]))[0]
 
 
@@ -67,7 +67,7 @@ def rotate(xyz, angle, rng=None):
     return (xyz @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])).astype(np.float32)
 
 
-def radial_alignment(xyz):
+def measure_radial_alignment(xyz):
     """Return |cos| of the angle between the widest direction and the ray; at 1, "left" is undefined."""
     centre = xyz.mean(axis=0)[:2].astype(float)
     widest = np.linalg.eigh(np.cov(xyz[:, :2].T.astype(float)))[1][:, -1]
@@ -89,20 +89,20 @@ def test_silhouettes_of_random_clusters_equal_plain_ones(seed):
 
 @needs_data
 def test_silhouettes_of_real_clusters_equal_plain_ones():
-    raw = np.fromfile(sorted(SCANS.glob("*.bin"))[4], np.float32).reshape(-1, 4)
-    found = segment_cloud(PointCloud(np.ascontiguousarray(raw[:, :3])))
-    ids = range(1, found.cluster_ids.max() + 1)
+    values = np.fromfile(sorted(SCANS.glob("*.bin"))[4], np.float32).reshape(-1, 4)
+    segmented = segment_cloud(PointCloud(np.ascontiguousarray(values[:, :3])))
+    ids = range(1, segmented.cluster_ids.max() + 1)
     assert len(ids) > 20
-    for points in (found.xyz[found.cluster_ids == k] for k in ids):
+    for points in (segmented.xyz[segmented.cluster_ids == k] for k in ids):
         for scales in ((1.0,), (1.0, 0.9, 0.8)):
-            np.testing.assert_array_equal(to_pixels(silhouette(points, scales)), draw_plainly(points, scales))
+            np.testing.assert_array_equal(to_pixels(draw_silhouette(points, scales)), draw_plainly(points, scales))
 
 
 def test_the_window_fits_the_cluster_and_row_0_is_its_top():
     # An L as seen from the sensor: upright on the left, foot to the right.
     upright = np.column_stack([np.full(60, 9.0), np.full(60, 0.5), np.linspace(0, 1.8, 60)])
     foot = np.column_stack([np.full(60, 9.0), np.linspace(-0.5, 0.5, 60), np.zeros(60)])
-    pixels = to_pixels(silhouette(np.concatenate([upright, foot]).astype(np.float32)))
+    pixels = to_pixels(draw_silhouette(np.concatenate([upright, foot]).astype(np.float32)))
     left = 31  # left of the sensor is the highest y
     assert pixels[:, left].all() and pixels[-1].all()
     assert not pixels[:70, :28].any()
@@ -124,16 +124,16 @@ def test_similarity_is_the_cosine_of_flattened_images(seed):
     rng = np.random.default_rng(seed)
     pixels = rng.random((5, ROWS, COLUMNS)) < rng.random((5, 1, 1))
     images = np.stack([from_pixels(p) for p in pixels])
-    flat = pixels.reshape(5, -1).astype(float)
-    norm = np.linalg.norm(flat, axis=1) * np.linalg.norm(flat[0])
-    expected = flat @ flat[0] / np.where(norm > 0, norm, 1.0)  # 0 for a blank image
+    vectors = pixels.reshape(5, -1).astype(float)
+    norms = np.linalg.norm(vectors, axis=1) * np.linalg.norm(vectors[0])
+    expected = vectors @ vectors[0] / np.where(norms > 0, norms, 1.0)  # 0 for a blank image
     np.testing.assert_allclose(compute_similarity(images, images[0]), expected, rtol=0, atol=1e-12)
 
 
 @given(seeds)
 def test_similarity_is_symmetric_and_exactly_1_with_itself(seed):
     rng = np.random.default_rng(seed)
-    images = np.stack([silhouette(make_cluster(rng)) for _ in range(3)])
+    images = np.stack([draw_silhouette(make_cluster(rng)) for _ in range(3)])
     table = np.stack([compute_similarity(images, image) for image in images])
     assert (np.diag(table) == 1.0).all()  # so that a threshold of 1 still accepts the seed itself
     np.testing.assert_array_equal(table, table.T)
@@ -150,36 +150,36 @@ def test_similarity_with_a_blank_image_is_0():
 @given(seeds, st.floats(-np.pi, np.pi))
 def test_rotating_about_the_sensor_keeps_the_silhouette(seed, angle):
     xyz = make_cluster(np.random.default_rng(seed), 300)
-    if radial_alignment(xyz) < 0.999:
-        moved = silhouette(rotate(xyz, angle))
-        assert compute_similarity(moved[None], silhouette(xyz))[0] > 0.97
+    if measure_radial_alignment(xyz) < 0.999:
+        rotated_image = draw_silhouette(rotate(xyz, angle))
+        assert compute_similarity(rotated_image[None], draw_silhouette(xyz))[0] > 0.97
 
 
 @given(seeds, st.floats(1.0, 5.0))
 def test_moving_along_the_ray_keeps_the_silhouette(seed, factor):
     xyz = make_cluster(np.random.default_rng(seed), 300)
-    if radial_alignment(xyz) < 0.999:
+    if measure_radial_alignment(xyz) < 0.999:
         offset = (xyz.mean(axis=0) * (factor - 1)).astype(np.float32) * np.float32([1, 1, 0])
-        moved = silhouette(xyz + offset)
-        assert compute_similarity(moved[None], silhouette(xyz))[0] > 0.97
+        shifted_image = draw_silhouette(xyz + offset)
+        assert compute_similarity(shifted_image[None], draw_silhouette(xyz))[0] > 0.97
 
 
 @given(seeds)
 def test_a_mirrored_cluster_has_the_mirrored_silhouette(seed):
     # Left and right are exchanged. Pixels are half-open, so the images are not bit-equal.
     xyz = make_cluster(np.random.default_rng(seed), 300)
-    if radial_alignment(xyz) < 0.999:
-        mirrored = to_pixels(silhouette(xyz * np.float32([1, -1, 1])))
-        assert compute_similarity(from_pixels(mirrored[:, ::-1])[None], silhouette(xyz))[0] > 0.97
+    if measure_radial_alignment(xyz) < 0.999:
+        mirrored = to_pixels(draw_silhouette(xyz * np.float32([1, -1, 1])))
+        assert compute_similarity(from_pixels(mirrored[:, ::-1])[None], draw_silhouette(xyz))[0] > 0.97
 
 
 @given(seeds)
 def test_order_of_points_and_other_clusters_do_not_matter(seed):
     rng = np.random.default_rng(seed)
     a, b = make_cluster(rng, 200), make_cluster(rng, 100)
-    both = draw_silhouettes(np.concatenate([b, a]), np.array([0, 100, 300]), np.ones((2, 1)))
-    np.testing.assert_array_equal(both, [silhouette(b), silhouette(a)])
-    assert compute_similarity(silhouette(rng.permutation(a))[None], both[1])[0] > 0.97
+    images = draw_silhouettes(np.concatenate([b, a]), np.array([0, 100, 300]), np.ones((2, 1)))
+    np.testing.assert_array_equal(images, [draw_silhouette(b), draw_silhouette(a)])
+    assert compute_similarity(draw_silhouette(rng.permutation(a))[None], images[1])[0] > 0.97
 
 
 @given(seeds, st.integers(0, 9))
@@ -187,19 +187,19 @@ def test_augmentation_only_adds_pixels(seed, steps):
     # Closing and dilation are monotonic, so a subset stays a subset.
     xyz = make_cluster(np.random.default_rng(seed))
     scales = compute_cpa_scales(np.array([20.0]), CpaParams(steps=steps))[0]
-    plain, augmented = to_pixels(silhouette(xyz)), to_pixels(silhouette(xyz, scales))
-    assert (augmented >= plain).all()
+    original, augmented = to_pixels(draw_silhouette(xyz)), to_pixels(draw_silhouette(xyz, scales))
+    assert (augmented >= original).all()
     if steps == 0:
-        np.testing.assert_array_equal(augmented, plain)
+        np.testing.assert_array_equal(augmented, original)
 
 
 def test_scales_are_those_of_the_paper():
     ranges = np.array([0, 14.999, 15, 22, 29.999, 30, 31, 1e5])
-    inside = [False, False, True, True, True, False, False, False]
+    in_range = [False, False, True, True, True, False, False, False]
     scales = compute_cpa_scales(ranges, CpaParams())
     assert scales.shape == (8, 3) and scales.dtype == np.float64
-    np.testing.assert_allclose(scales[inside], [[1.0, 0.9, 0.8]] * 3, rtol=0, atol=1e-12)
-    assert (scales[np.logical_not(inside)] == 1).all()
+    np.testing.assert_allclose(scales[in_range], [[1.0, 0.9, 0.8]] * 3, rtol=0, atol=1e-12)
+    assert (scales[np.logical_not(in_range)] == 1).all()
 
 
 def test_scale_decreases_in_steps_down_to_min_scale():
@@ -216,8 +216,8 @@ def test_scale_decreases_in_steps_down_to_min_scale():
 def test_zero_steps_or_clusters_give_empty_arrays_of_right_shape():
     np.testing.assert_array_equal(compute_cpa_scales(np.array([5.0, 20.0]), CpaParams(steps=0)), np.ones((2, 1)))
     assert compute_cpa_scales(np.zeros(0), CpaParams()).shape == (0, 3)
-    none = draw_silhouettes(np.zeros((0, 3), np.float32), np.array([0]), np.ones((0, 3)))
-    assert none.shape == (0, ROWS) and none.dtype == np.uint32
+    images = draw_silhouettes(np.zeros((0, 3), np.float32), np.array([0]), np.ones((0, 3)))
+    assert images.shape == (0, ROWS) and images.dtype == np.uint32
 
 
 @pytest.mark.parametrize("at", [[8, 1, -1], [0, 0, 1], [0.3, -70, -1.2], [-7e4, 7e4, 3]])
@@ -225,26 +225,26 @@ def test_zero_steps_or_clusters_give_empty_arrays_of_right_shape():
 def test_coincident_points_set_the_top_left_pixel(at, scales):
     # A point without extent falls into the first pixel of the window.
     for count in (1, 2, 7, 100):
-        pixels = to_pixels(silhouette(np.full((count, 3), at, np.float32), scales))
+        pixels = to_pixels(draw_silhouette(np.full((count, 3), at, np.float32), scales))
         assert pixels[:2, :2].all() and pixels.sum() == 4
 
 
 def test_a_vertical_line_fills_the_first_column():
     line = np.float32([8, 2, 0]) + np.linspace(-1.5, 0.5, 400, dtype=np.float32)[:, None] * np.float32([0, 0, 1])
-    pixels = to_pixels(silhouette(line))
+    pixels = to_pixels(draw_silhouette(line))
     assert pixels[:, :2].all() and not pixels[:, 2:].any()
     np.testing.assert_array_equal(pixels, draw_plainly(line))
 
 
 def test_a_horizontal_line_fills_the_first_row():
     line = np.float32([8, 0, -1]) + np.linspace(-1, 1, 200, dtype=np.float32)[:, None] * np.float32([0, 1, 0])
-    pixels = to_pixels(silhouette(line))
+    pixels = to_pixels(draw_silhouette(line))
     assert pixels[:2].all() and not pixels[2:].any()
 
 
 def test_the_input_is_not_modified():
     xyz = make_cluster(np.random.default_rng(0), 50)
-    before, scales = xyz.copy(), np.array([[1.0, 0.9]])
+    original, scales = xyz.copy(), np.array([[1.0, 0.9]])
     draw_silhouettes(xyz, np.array([0, 50]), scales)
-    np.testing.assert_array_equal(xyz, before)
+    np.testing.assert_array_equal(xyz, original)
     assert scales.tolist() == [[1.0, 0.9]]

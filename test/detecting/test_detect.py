@@ -77,9 +77,9 @@ def test_every_frame_of_any_recording_has_a_result(kind, tmp_path, monkeypatch, 
     assert [frame["name"] for frame in content["frames"]] == names and len(made) == len(names)
     assert content["detector"] == content["weights"] == NAME and content["skipped"] == []
     assert content["parameters"]["least"] == 0.5 and "metres" in content["units"]["box"]
-    found = objects(content)
-    for frame, said in zip(open_recording(data), content["frames"]):
-        assert {k: said[k] for k in ("sequence", "index", "stamp_ns", "frame_id")} == {
+    rows_by_frame = objects(content)
+    for frame, entry in zip(open_recording(data), content["frames"]):
+        assert {k: entry[k] for k in ("sequence", "index", "stamp_ns", "frame_id")} == {
             "sequence": frame.sequence,
             "index": frame.index,
             "stamp_ns": frame.stamp_ns,
@@ -87,40 +87,42 @@ def test_every_frame_of_any_recording_has_a_result(kind, tmp_path, monkeypatch, 
         }
         expected = MadeDetector()(frame.load()).detections
         np.testing.assert_array_equal(
-            np.float32(found[frame.name]),
+            np.float32(rows_by_frame[frame.name]),
             np.column_stack([expected.class_ids, expected.scores, expected.boxes]).astype(np.float32),
         )
         camera = choose_calibration(frame)[0].lidar_to_camera
-        back = read_results(out / f"kitti/{frame.name}.txt", camera)
-        np.testing.assert_allclose(back.boxes[:, :6], expected.boxes[:, :6], atol=2e-4)
-        assert [e["score"] for e in back.extras] == pytest.approx(expected.scores, abs=1e-4)
+        kitti_results = read_results(out / f"kitti/{frame.name}.txt", camera)
+        np.testing.assert_allclose(kitti_results.boxes[:, :6], expected.boxes[:, :6], atol=2e-4)
+        assert [e["score"] for e in kitti_results.extras] == pytest.approx(expected.scores, abs=1e-4)
     table = [*csv.DictReader((out / "detections.csv").open())]
     assert [(row["frame"], row["class"], row["id"]) for row in table] == [(name, "Pedestrian", "") for name in names]
     for row in table:
-        assert [float(row[k]) for k in ("score", "x", "yaw")] == [found[row["frame"]][0][k] for k in (1, 2, 8)]
+        assert [float(row[k]) for k in ("score", "x", "yaw")] == [rows_by_frame[row["frame"]][0][k] for k in (1, 2, 8)]
 
 
 def test_all_formats_of_a_run_have_the_same_boxes(drives, tmp_path, monkeypatch):
     out = tmp_path / "out"
     assert detect(monkeypatch, drives, "--out", out, "--format", ALL, "--min-score", 0.1) == 0
-    found = objects(read_json(out))
-    assert {len(rows) for rows in found.values()} == {2}
+    rows_by_frame = objects(read_json(out))
+    assert {len(rows) for rows in rows_by_frame.values()} == {2}
     frames = open_recording(drives).frames
     labels = import_labels(out / "openlabel", "openlabel", frames)
-    for frame, each in zip(frames, labels.frames):
-        rows = np.array(found[frame.name])
-        np.testing.assert_allclose(each.boxes, rows[:, 2:], atol=1e-6)
-        assert each.scores.tolist() == rows[:, 1].tolist()
-    bag, shown = seen_by_view(out / "bag")
+    for frame, frame_labels in zip(frames, labels.frames):
+        rows = np.array(rows_by_frame[frame.name])
+        np.testing.assert_allclose(frame_labels.boxes, rows[:, 2:], atol=1e-6)
+        assert frame_labels.scores.tolist() == rows[:, 1].tolist()
+    bag, results = open_as_view(out / "bag")
     for i, frame in enumerate(bag.frames):
         np.testing.assert_array_equal(frame.load().xyz, frames[i].load().xyz)
-        boxes = shown.make_layers(i, frame, 0.0)["detections"]["made_detector"]
-        np.testing.assert_allclose([row[:7] for row in boxes], np.array(found[frames[i].name])[:, 2:], atol=1e-3)
-        assert [row[8] for row in boxes] == pytest.approx([row[1] for row in found[frames[i].name]])
+        boxes = results.make_layers(i, frame, 0.0)["detections"]["made_detector"]
+        np.testing.assert_allclose(
+            [row[:7] for row in boxes], np.array(rows_by_frame[frames[i].name])[:, 2:], atol=1e-3
+        )
+        assert [row[8] for row in boxes] == pytest.approx([row[1] for row in rows_by_frame[frames[i].name]])
         assert [row[9] for row in boxes] == [{"a": 0.5}, {}]
 
 
-def seen_by_view(path):
+def open_as_view(path):
     """Open a bag as `view` does: the recording and its results."""
     recording = open_recording(path, points=choose_points_topic(path))
     return recording, read_recorded_results(recording.frames.poses, [frame.stamp_ns for frame in recording.frames[:]])
@@ -149,14 +151,14 @@ def test_output_bag_has_the_messages_of_the_nodes(drives, tmp_path, monkeypatch,
     with Bag(out / "bag") as bag:
         assert bag.counts.get(POINTS, 0) == clouds * len(frames)
         for topic in "/made_detector/output/detections", "/tracker/output/tracks":
-            marked = read_objects_by_stamp(bag, [topic])[topic]
+            marker_objects = read_objects_by_stamp(bag, [topic])[topic]
             arrays = [from_detection_array(message) for _, _, message in bag.messages([f"{topic}_3d"])]
-            assert sorted(marked) == stamps == [array.stamp_ns for array in arrays]
+            assert sorted(marker_objects) == stamps == [array.stamp_ns for array in arrays]
             for array in arrays:
-                np.testing.assert_allclose(array.boxes, marked[array.stamp_ns].boxes, atol=1e-9)
-                assert array.labels == marked[array.stamp_ns].labels
-                assert array.ids.tolist() == marked[array.stamp_ns].ids.tolist()
-        assert sum(map(len, marked.values())) > 0
+                np.testing.assert_allclose(array.boxes, marker_objects[array.stamp_ns].boxes, atol=1e-9)
+                assert array.labels == marker_objects[array.stamp_ns].labels
+                assert array.ids.tolist() == marker_objects[array.stamp_ns].ids.tolist()
+        assert sum(map(len, marker_objects.values())) > 0
 
 
 def test_bag_with_duplicate_stamps_is_written_without_labels(tmp_path, monkeypatch, capsys):
@@ -164,7 +166,7 @@ def test_bag_with_duplicate_stamps_is_written_without_labels(tmp_path, monkeypat
     frames = [replace(frame, stamp_ns=STAMP) for frame in scans(3)]
     recording = Recording(tmp_path, "", frames)
     run = make_run(recording, tmp_path / "out")
-    run_detector(run, MadeDetector, [partial(BagFormat, clouds=True, tracked=False)])
+    run_detector(run, MadeDetector, [partial(BagFormat, with_clouds=True, with_tracks=False)])
     with Bag(tmp_path / "out/bag") as bag:
         assert bag.counts[POINTS] == 3 and bag.counts[TRUTH] == 1
 
@@ -176,25 +178,25 @@ def test_written_results_score_like_the_detector(kitti, tmp_path, monkeypatch, c
         frames = [replace(frame, calibration=return_none) for frame in open_recording(kitti)]
         kitti = tmp_path / "bag"
         write_bag(kitti, frames, skipped=[])
-    out, asked = tmp_path / "out", ("--min-score", 0.001)
-    assert detect(monkeypatch, kitti, "--out", out, "--format", "kitti", *asked) == camera
-    said = capsys.readouterr().out
-    assert ("nominal camera" in " ".join(said.split())) == (not camera)
-    direct, _ = evaluate_detection(tmp_path, "--data", kitti, "--weights", NAME, *asked)
-    assert direct["frames"] == 3 and direct["ap"]["Pedestrian"]["bev"]["easy"]["r40"] == 100
+    out, options = tmp_path / "out", ("--min-score", 0.001)
+    assert detect(monkeypatch, kitti, "--out", out, "--format", "kitti", *options) == camera
+    output = capsys.readouterr().out
+    assert ("nominal camera" in " ".join(output.split())) == (not camera)
+    detector_scores, _ = evaluate_detection(tmp_path, "--data", kitti, "--weights", NAME, *options)
+    assert detector_scores["frames"] == 3 and detector_scores["ap"]["Pedestrian"]["bev"]["easy"]["r40"] == 100
     for folder in out, out / "kitti":
-        read, _ = evaluate_detection(tmp_path, "--data", kitti, "--results", folder)
-        assert numbers_in(read["ap"]) == pytest.approx(numbers_in(direct["ap"]), abs=1e-3)
-        assert read["skipped"] == direct["skipped"]
+        result_scores, _ = evaluate_detection(tmp_path, "--data", kitti, "--results", folder)
+        assert collect_numbers(result_scores["ap"]) == pytest.approx(collect_numbers(detector_scores["ap"]), abs=1e-3)
+        assert result_scores["skipped"] == detector_scores["skipped"]
 
 
-def numbers_in(content):
+def collect_numbers(content):
     """Return all numbers in nested dicts, in their order."""
     inner = content.values() if isinstance(content, dict) else [content]
     return [
         number
-        for each in inner
-        for number in (numbers_in(each) if isinstance(each, dict) else [each] * (each is not None))
+        for value in inner
+        for number in (collect_numbers(value) if isinstance(value, dict) else [value] * (value is not None))
     ]
 
 
@@ -214,32 +216,34 @@ def test_tracks_of_different_drives_have_different_ids(drives, tmp_path, monkeyp
     assert ids["0000"] and ids["0007"] and not ids["0000"] & ids["0007"]
     frames = open_recording(drives).frames
     labels = import_labels(out / "openlabel", "openlabel", frames)
-    for frame, each, said in zip(frames, labels.frames, content["frames"]):
-        assert each.track_ids.tolist() == [row["id"] for row in said["objects"]]
-        assert [e["velocity"] for e in each.extra] == [row["velocity"] for row in said["objects"]]
+    for frame, frame_labels, entry in zip(frames, labels.frames, content["frames"]):
+        assert frame_labels.track_ids.tolist() == [row["id"] for row in entry["objects"]]
+        assert [e["velocity"] for e in frame_labels.extra] == [row["velocity"] for row in entry["objects"]]
         camera = frame.calibration().lidar_to_camera
         tracks = read_tracking_labels(out / f"kitti/{frame.sequence}.txt", camera)[frame.index]
         np.testing.assert_allclose(tracks.boxes[:, :3], np.array(objects(content)[frame.name])[:, 2:5], atol=2e-4)
-        assert [e["track_id"] for e in tracks.extras] == each.track_ids.tolist()
+        assert [e["track_id"] for e in tracks.extras] == frame_labels.track_ids.tolist()
 
 
 def test_written_tracks_score_like_the_tracker(drives, tmp_path, monkeypatch):
     assert (
         detect(monkeypatch, drives, "--out", tmp_path, "--format", "kitti", "--track", "--ego", "none", "--force") == 0
     )
-    recording, itself, read = open_recording(drives), TrackingReport(), TrackingReport()
+    recording, tracker_report, file_report = open_recording(drives), TrackingReport(), TrackingReport()
     fill_report(
-        itself,
+        tracker_report,
         recording,
         partial(measure_tracking, lambda: MadeDetector().with_min_score(0.05), TrackingParams(), "none"),
     )
     for frame in recording:
         if (truth := frame.truth()) is not None:
-            found = read_tracking_labels(tmp_path / f"kitti/{frame.sequence}.txt", frame.calibration().lidar_to_camera)
-            read.update(make_observation(frame.sequence, frame.index, truth, found[frame.index], frame.calibration()))
-    scores = [report.compute()["classes"] for report in (read, itself)]
+            tracks = read_tracking_labels(tmp_path / f"kitti/{frame.sequence}.txt", frame.calibration().lidar_to_camera)
+            file_report.update(
+                make_observation(frame.sequence, frame.index, truth, tracks[frame.index], frame.calibration())
+            )
+    scores = [report.compute()["classes"] for report in (file_report, tracker_report)]
     assert scores[0].keys() == scores[1].keys() and scores[0]["Pedestrian"]["boxes"] > 0
-    assert numbers_in(scores[0]) == pytest.approx(numbers_in(scores[1]), abs=1e-3)
+    assert collect_numbers(scores[0]) == pytest.approx(collect_numbers(scores[1]), abs=1e-3)
 
 
 def test_drives_of_a_bag_are_tracked_separately(tmp_path, monkeypatch):
@@ -268,13 +272,13 @@ def test_stopped_run_is_resumed(drives, tmp_path, made):
             raise Stopped
 
     recording = open_recording(drives)
-    whole, parts = (make_run(recording, tmp_path / name) for name in ("whole", "parts"))
-    run_detector(whole, MadeDetector, [Json], tracking=TrackingParams(), ego="none")
+    full_run, stopped_run = (make_run(recording, tmp_path / name) for name in ("whole", "parts"))
+    run_detector(full_run, MadeDetector, [Json], tracking=TrackingParams(), ego="none")
     made.clear()
     with pytest.raises(Stopped):
-        run_detector(parts, partial(MadeDetector, fails=stop), [Json], ego="none", tracking=TrackingParams())
+        run_detector(stopped_run, partial(MadeDetector, fails=stop), [Json], ego="none", tracking=TrackingParams())
     assert len(made) == 3 and not (tmp_path / "parts/detections.json").exists()
-    run_detector(parts, MadeDetector, [Json], tracking=TrackingParams(), ego="none")
+    run_detector(stopped_run, MadeDetector, [Json], tracking=TrackingParams(), ego="none")
     assert len(made) == len(recording)  # none of them twice
     assert read_json(tmp_path / "parts") == read_json(tmp_path / "whole")
 
@@ -300,26 +304,26 @@ def test_folder_of_another_run_needs_force(kitti, tmp_path, monkeypatch, capsys,
     assert len(made) == 8 and not (out / "detections.csv").exists()
     assert not [*out.glob("kitti/*")] and len(objects(read_json(out))["000000"]) == 2
     write(tmp_path / "mine/letter.txt", "dear")
-    said = refused(monkeypatch, capsys, kitti, "--out", tmp_path / "mine")
-    assert "has no run of this command" in said
+    error = refused(monkeypatch, capsys, kitti, "--out", tmp_path / "mine")
+    assert "has no run of this command" in error
 
 
 # Invalid options
 
 
 def test_unreadable_frames_are_reported_and_others_written(kitti, tmp_path, monkeypatch, capsys, made):
-    cut, out = kitti / "training/velodyne/000001.bin", tmp_path / "out"
-    whole = cut.read_bytes()
-    write(cut, b"123")
+    scan_path, out = kitti / "training/velodyne/000001.bin", tmp_path / "out"
+    content_bytes = scan_path.read_bytes()
+    write(scan_path, b"123")
     for _ in range(2):  # the failure is not remembered
         assert detect(monkeypatch, kitti, "--out", out, "--format", ALL) == 1
-        assert "000001.bin" in (said := capsys.readouterr().out) and "3 frames" in said
+        assert "000001.bin" in (output := capsys.readouterr().out) and "3 frames" in output
     assert len(made) == 3
     content = read_json(out)
     assert [frame["name"] for frame in content["frames"]] == ["000000", "000002", "000003"]
     assert "000001.bin" in content["skipped"][0]
     assert {path.stem for path in (out / "kitti").iterdir()} == {"000000", "000002", "000003"}
-    write(cut, whole)
+    write(scan_path, content_bytes)
     assert detect(monkeypatch, kitti, "--out", out) == 0 and len(made) == 4
 
 
@@ -328,11 +332,11 @@ def test_unreadable_labels_and_cameras_are_optional(kitti, tmp_path, monkeypatch
     for i in 0, 2, 3:
         (kitti / f"training/calib/{i:06}.txt").unlink()
     assert detect(monkeypatch, kitti, "--out", tmp_path / "out", "--format", ALL) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "labels left out: " in said and "000001.txt" in said
-    assert said.count("calibration left out: ") == 1 and "(2 more such frames)" in said
-    assert said.count("nominal camera") == 1
-    assert "calibration left out: " in said and "nominal camera" in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert "labels left out: " in output and "000001.txt" in output
+    assert output.count("calibration left out: ") == 1 and "(2 more such frames)" in output
+    assert output.count("nominal camera") == 1
+    assert "calibration left out: " in output and "nominal camera" in output
     assert len(read_json(tmp_path / "out")["frames"]) == 4
 
 
@@ -343,8 +347,8 @@ def test_equal_problems_are_reported_once_with_count(kitti, tmp_path, monkeypatc
         lambda self, frame: DetectionResult(Detections.none(), problem=f"{np.ptp(frame.xyz)} m are not much"),
     )
     assert detect(monkeypatch, kitti, "--out", tmp_path / "out") == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert said.count("are not much") == 1 and "in 4 frames" in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert output.count("are not much") == 1 and "in 4 frames" in output
 
 
 def test_non_finite_numbers_are_not_written(kitti, tmp_path, monkeypatch, capsys):
@@ -356,7 +360,7 @@ def test_non_finite_numbers_are_not_written(kitti, tmp_path, monkeypatch, capsys
 
 
 @pytest.mark.parametrize(
-    "arguments, words",
+    "arguments, message",
     [
         (["--format", "kiti"], "unknown value 'kiti'; did you mean 'kitti'"),
         (["--ego", "none"], "require --track"),
@@ -364,34 +368,36 @@ def test_non_finite_numbers_are_not_written(kitti, tmp_path, monkeypatch, capsys
         (["--min-score", 2], "2"),
     ],
 )
-def test_unusable_options_are_rejected(arguments, words, kitti, tmp_path, monkeypatch, capsys, made):
+def test_unusable_options_are_rejected(arguments, message, kitti, tmp_path, monkeypatch, capsys, made):
     assert detect(monkeypatch, kitti, "--out", tmp_path / "out", *arguments) == 2
-    assert words in capsys.readouterr().err and made == [] and not (tmp_path / "out").exists()
+    assert message in capsys.readouterr().err and made == [] and not (tmp_path / "out").exists()
 
 
 # Pictures and videos
 
 
 def test_pictures_and_video_show_every_frame(drives, tmp_path, monkeypatch, made):
-    out, film = tmp_path / "out", tmp_path / "films/drive.gif"
-    assert detect(monkeypatch, drives, "--out", out, "--png", "--video", film, "--track", "--ego", "none") == 0
+    out, video = tmp_path / "out", tmp_path / "films/drive.gif"
+    assert detect(monkeypatch, drives, "--out", out, "--png", "--video", video, "--track", "--ego", "none") == 0
     names = [frame.name for frame in open_recording(drives)]
     images = {name: Image.open(out / f"png/{name}.png") for name in names}
     assert {image.size for image in images.values()} == {(1280, 720)}
-    assert Image.open(film).n_frames == len(names)
+    assert Image.open(video).n_frames == len(names)
     assert not (out / "detections.json").exists()  # not requested
-    drawn = {name: (out / f"png/{name}.png").stat().st_mtime_ns for name in names}
+    first_times = {name: (out / f"png/{name}.png").stat().st_mtime_ns for name in names}
     (out / f"png/{names[1]}.png").unlink()
     assert detect(monkeypatch, drives, "--out", out, "--png", "--track", "--ego", "none") == 0
-    again = {name: (out / f"png/{name}.png").stat().st_mtime_ns for name in names}
-    assert [name for name in names if again[name] != drawn[name]] == [names[1]]
+    second_times = {name: (out / f"png/{name}.png").stat().st_mtime_ns for name in names}
+    assert [name for name in names if second_times[name] != first_times[name]] == [names[1]]
     assert len(made) == len(names)
 
 
 def test_unsupported_video_is_rejected_before_any_work(drives, tmp_path, monkeypatch, capsys, made):
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "av" else find(name, *more))
-    for name, words in ("a.mp4", "lidar_perception[video]"), ("a.avi", "is not a video"):
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *more: None if name == "av" else find_spec(name, *more)
+    )
+    for name, message in ("a.mp4", "lidar_perception[video]"), ("a.avi", "is not a video"):
         line = refused(monkeypatch, capsys, drives, "--out", tmp_path / "out", "--video", tmp_path / name)
-        assert words in line
+        assert message in line
     assert made == [] and not (tmp_path / "out").exists()

@@ -22,4 +22,4 @@ def test_pictures_show_the_time(stamp, timed, expected, tmp_path):
     run = make_run(Recording(tmp_path / "drive", "", frames, has_times=timed), tmp_path / "out")
     drawer = FrameDrawer(run)
     drawer.get_stage(FrameResult(frames[0], Detections.none(), "velodyne", 1.0))
-    assert drawer.time(stamp) == expected
+    assert drawer.format_time(stamp) == expected

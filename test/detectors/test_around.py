@@ -29,13 +29,13 @@ from lidar_perception.types import InputError, PointCloud
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def shipped(version="v4", range="auto"):
+def open_shipped(version="v4", range="auto"):
     return open_detector(
         POINTPILLARS_WEIGHTS / f"pointpillars_{version}_compact.safetensors", "cpu", min_score=0.05, range=range
     )
 
 
-def columns_of(scan):
+def compute_columns(scan):
     """Return the experts' columns, which would differ slightly for a rotated cloud."""
     ground = segment_ground(scan, EXPERT_GROUND)
     return {"ground": ground, "cluster_ids": cluster_obstacles(scan.xyz, ground, EXPERT_CLUSTERING)}
@@ -48,56 +48,59 @@ def street(streets):
 
 @pytest.mark.parametrize("version", ["v0", "v4"])
 def test_rotated_cloud_has_rotated_boxes(version, street):
-    detector = shipped(version, "around")
-    columns = columns_of(street.frame)
-    found = detector(street.frame, **columns).detections
-    turned = detector(rotate_half_turn(street.frame), **columns).detections
-    assert min((found.boxes[:, 0] > 3).sum(), (found.boxes[:, 0] < -3).sum()) > 3
-    assert same(turned, replace(found, boxes=rotate_boxes_half_turn(found.boxes)), atol=1e-4)
+    detector = open_shipped(version, "around")
+    columns = compute_columns(street.frame)
+    detections = detector(street.frame, **columns).detections
+    rotated_detections = detector(rotate_half_turn(street.frame), **columns).detections
+    assert min((detections.boxes[:, 0] > 3).sum(), (detections.boxes[:, 0] < -3).sum()) > 3
+    assert same(rotated_detections, replace(detections, boxes=rotate_boxes_half_turn(detections.boxes)), atol=1e-4)
 
 
 def test_clear_cars_are_found_behind_and_at_the_sides(street):
     truth = street.truth
-    plain = np.array([e["num_points"] > 100 and e["visible"] > 0.5 for e in truth.extras])
+    is_clear = np.array([e["num_points"] > 100 and e["visible"] > 0.5 for e in truth.extras])
     angle = np.degrees(np.arctan2(truth.boxes[:, 1], truth.boxes[:, 0]))
-    near = horizontal_range(truth.boxes) < 30
-    cars = truth.boxes[(truth.class_ids == CAR) & plain & near & (np.abs(angle) > 60)]
-    found = open_detector("fused", "cpu", range="around")(street.frame).detections
-    mine = found.boxes[found.class_ids == CAR]
+    is_near = horizontal_range(truth.boxes) < 30
+    cars = truth.boxes[(truth.class_ids == CAR) & is_clear & is_near & (np.abs(angle) > 60)]
+    detections = open_detector("fused", "cpu", range="around")(street.frame).detections
+    detected_cars = detections.boxes[detections.class_ids == CAR]
     with pytest.raises(InputError, match="'Around'; did you mean 'around'"):
         open_detector("fused", "cpu", range="Around")
     assert len(cars) >= 4
-    assert len(match_centres(mine[:, :3], cars[:, :3], 1.0)[0]) >= 0.8 * len(cars)
+    assert len(match_centres(detected_cars[:, :3], cars[:, :3], 1.0)[0]) >= 0.8 * len(cars)
 
 
 def test_around_equals_single_pass_away_from_border(street):
-    detector, columns = shipped(), columns_of(street.frame)
-    half = replace(detector.proposer.header, config=replace(detector.proposer.config, **HALF))
-    one = make_detector(detector.proposer.network, half, detector.params)
-    apart = [
-        found[np.flatnonzero(found.boxes[:, 0] > 8)]
-        for found in (each(street.frame, **columns).detections for each in (one, detector.with_range("around")))
+    detector, columns = open_shipped(), compute_columns(street.frame)
+    half_header = replace(detector.proposer.header, config=replace(detector.proposer.config, **HALF))
+    single_pass = make_detector(detector.proposer.network, half_header, detector.params)
+    detections = [
+        ahead_detections[np.flatnonzero(ahead_detections.boxes[:, 0] > 8)]
+        for ahead_detections in (
+            one_detector(street.frame, **columns).detections
+            for one_detector in (single_pass, detector.with_range("around"))
+        )
     ]
-    assert len(apart[0]) > 3 and same(*apart)
+    assert len(detections[0]) > 3 and same(*detections)
 
 
 def test_range_can_be_changed_and_restored(street):
-    detector = shipped("v1")
+    detector = open_shipped("v1")
     around = detector.with_range("around")
     assert detector.with_range("auto") is detector.with_range("ahead") is detector
     assert around.with_range("around") is around
     assert around.proposer.config.low == RANGES["around"]["low"]
     assert same(around.with_range("ahead")(street.frame), detector(street.frame))
-    trained = random_detector(**RANGES["around"])  # one pass is enough
-    assert trained.with_range("around") is trained and len(trained.proposer.half_turns) == 1
+    around_detector = random_detector(**RANGES["around"])  # one pass is enough
+    assert around_detector.with_range("around") is around_detector and len(around_detector.proposer.half_turns) == 1
 
 
 def test_around_accepts_empty_half_and_empty_cloud(street):
-    detector = shipped(range="around")
-    ahead = detector(street.frame.take(np.flatnonzero(street.frame.xyz[:, 0] > 6)))
-    assert len(ahead.detections) and ahead.problem is None
-    nothing = detector(PointCloud.of(np.zeros((0, 3))))
-    assert len(nothing.detections) == 0 and "empty" in nothing.problem
+    detector = open_shipped(range="around")
+    ahead_result = detector(street.frame.take(np.flatnonzero(street.frame.xyz[:, 0] > 6)))
+    assert len(ahead_result.detections) and ahead_result.problem is None
+    empty_result = detector(PointCloud.of(np.zeros((0, 3))))
+    assert len(empty_result.detections) == 0 and "empty" in empty_result.problem
 
 
 def test_unsupported_range_is_rejected():

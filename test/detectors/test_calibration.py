@@ -27,18 +27,18 @@ LINES = {"Car": (0.6, 0.5), "Pedestrian": (1.4, -0.8)}
 def test_calibration_keeps_order_and_is_invertible(scores, slope, offset):
     lines = {"Car": (slope, offset)}
     scores = np.sort(np.array(scores, np.float32))
-    found = Detections.of(np.ones((len(scores), 7)), CLASSES.index("Car"), scores)
-    after = calibrate_scores(found, lines).scores
-    assert (np.diff(after) >= 0).all() and after.dtype == np.float32
-    assert ((after >= 0) & (after <= 1)).all()
-    others = Detections.of(found.boxes, CLASSES.index("Cyclist"), scores)
-    np.testing.assert_array_equal(calibrate_scores(others, lines).scores, scores)
+    detections = Detections.of(np.ones((len(scores), 7)), CLASSES.index("Car"), scores)
+    calibrated = calibrate_scores(detections, lines).scores
+    assert (np.diff(calibrated) >= 0).all() and calibrated.dtype == np.float32
+    assert ((calibrated >= 0) & (calibrated <= 1)).all()
+    uncalibrated_class = Detections.of(detections.boxes, CLASSES.index("Cyclist"), scores)
+    np.testing.assert_array_equal(calibrate_scores(uncalibrated_class, lines).scores, scores)
     for score in (0.0, 0.01, 0.3, 0.97, 1.0):
-        raw = to_raw_score("Car", score, lines)
-        assert 0 <= raw <= 1
-        if 1e-6 < raw < 1 - 1e-6:
-            beside = np.nextafter(np.float32(raw), np.float32([0, 1]))  # scores are float32
-            low, high = calibrate_scores(Detections.of(np.ones((2, 7)), 0, beside), lines).scores
+        raw_score = to_raw_score("Car", score, lines)
+        assert 0 <= raw_score <= 1
+        if 1e-6 < raw_score < 1 - 1e-6:
+            neighbours = np.nextafter(np.float32(raw_score), np.float32([0, 1]))  # scores are float32
+            low, high = calibrate_scores(Detections.of(np.ones((2, 7)), 0, neighbours), lines).scores
             assert low - 1e-6 <= score <= high + 1e-6
 
 
@@ -47,22 +47,25 @@ def test_calibration_keeps_order_and_is_invertible(scores, slope, offset):
 )
 def test_calibrated_detector_finds_same_boxes(make):
     detector, scan = make().with_min_score(0.0), frame()
-    plain = detector(scan).detections
+    raw_detections = detector(scan).detections
     (network,) = detector.networks
     network.header = replace(network.header, calibration=LINES)
-    found = detector(scan).detections
-    assert len(found) and same(found, calibrate_scores(plain, LINES), atol=1e-6)
-    assert same(detector.with_raw_scores()(scan), plain)
-    middle = float(np.median(found.scores))
+    detections = detector(scan).detections
+    assert len(detections) and same(detections, calibrate_scores(raw_detections, LINES), atol=1e-6)
+    assert same(detector.with_raw_scores()(scan), raw_detections)
+    median_score = float(np.median(detections.scores))
     # Weak boxes do not suppress strong ones, so a threshold only removes weak boxes.
-    strict = detector.with_min_score(middle)(scan).detections
-    assert 0 < len(strict) <= len(found) and (strict.scores >= np.float32(middle) - 1e-6).all()
-    best = detector.with_min_score(1.0)(scan).best
-    assert len(detector.with_min_score(1.0)(scan).detections) == 0 and set(best) == {*detector.classes}
+    strong_detections = detector.with_min_score(median_score)(scan).detections
+    assert (
+        0 < len(strong_detections) <= len(detections)
+        and (strong_detections.scores >= np.float32(median_score) - 1e-6).all()
+    )
+    best_scores = detector.with_min_score(1.0)(scan).best
+    assert len(detector.with_min_score(1.0)(scan).detections) == 0 and set(best_scores) == {*detector.classes}
 
 
 @pytest.mark.parametrize(
-    "broken",
+    "calibration",
     [
         {"Car": [0, 1]},
         {"Car": [1]},
@@ -73,8 +76,8 @@ def test_calibrated_detector_finds_same_boxes(make):
         {"Car": ["a", 0]},
     ],
 )
-def test_calibration_that_does_not_rise_is_rejected(tmp_path, broken):
-    header = Header(tiny("v0"), calibration=broken)
+def test_calibration_that_does_not_rise_is_rejected(tmp_path, calibration):
+    header = Header(tiny("v0"), calibration=calibration)
     save_checkpoint(tmp_path / "w.safetensors", lively(tiny("v0")), header)
     with pytest.raises(InputError, match="invalid calibration"):
         read_header(tmp_path / "w.safetensors")
@@ -84,14 +87,14 @@ def test_calibration_that_does_not_rise_is_rejected(tmp_path, broken):
 def test_save_header_keeps_stored_weights(tmp_path, half):
     path, config = tmp_path / "some.safetensors", tiny()
     save_checkpoint(path, lively(config), Header(config, calibration=LINES), half)
-    _, before = read_checkpoint(path, type(config))
+    _, original = read_checkpoint(path, type(config))
     save_header(path, Header(config, calibration={"Car": (1.0, 0.0)}))
-    header, after = read_checkpoint(path, type(config))
-    assert header.calibration == {"Car": (1.0, 0.0)} and after.keys() == before.keys()
-    assert all(value.dtype == before[name].dtype and value.equal(before[name]) for name, value in after.items())
+    header, stored = read_checkpoint(path, type(config))
+    assert header.calibration == {"Car": (1.0, 0.0)} and stored.keys() == original.keys()
+    assert all(value.dtype == original[name].dtype and value.equal(original[name]) for name, value in stored.items())
     # scans without enough objects give no calibration, so the file keeps its own
-    whole = path.read_bytes()
+    content = path.read_bytes()
     script = runpy.run_path(str(Path(__file__).parents[2] / "scripts/calibrate_weights.py"))
     result = CliRunner().invoke(script["main"], [str(object_folder(tmp_path / "scans", count=1)), str(path)])
     assert result.exit_code == 1 and "too few correct or wrong detections of Car" in result.output
-    assert path.read_bytes() == whole
+    assert path.read_bytes() == content

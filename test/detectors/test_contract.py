@@ -75,28 +75,28 @@ def test_array_gives_the_detections_of_its_frame(detectors, frame, name):
     cloud, ground = scan.points(), scan.xyz[:, 2] < -1.5
     assert same(detector(cloud), detector(scan))
     expected = detector(scan, ground=ground)
-    broken = np.insert(cloud, [0, 50], [[np.nan] * 4, [0, 0, 0, 1]], axis=0)
-    assert same(detector(broken, ground=np.insert(ground, [0, 50], True)), expected)
-    assert same(detector(broken.tolist(), ground=np.insert(ground, [0, 50], True).tolist()), expected)
+    invalid_cloud = np.insert(cloud, [0, 50], [[np.nan] * 4, [0, 0, 0, 1]], axis=0)
+    assert same(detector(invalid_cloud, ground=np.insert(ground, [0, 50], True)), expected)
+    assert same(detector(invalid_cloud.tolist(), ground=np.insert(ground, [0, 50], True).tolist()), expected)
     if "STM-CPA" not in name or "auto" in name:  # the others have no seed in this frame
         assert len(detector([]).detections) == 0 and detector(np.full((9, 3), np.nan)).problem
-    for wrong, said in ((np.ones((5, 5)), r"points\[:, :4\]"), (frame, "frame.load"), (None, "NoneType")):
-        with pytest.raises(InputError, match=said):
-            detector(wrong)
+    for argument, message in ((np.ones((5, 5)), r"points\[:, :4\]"), (frame, "frame.load"), (None, "NoneType")):
+        with pytest.raises(InputError, match=message):
+            detector(argument)
 
 
 @each_name
-@pytest.mark.parametrize("full", [255, 65535])
-def test_other_intensity_scale_is_reported_and_normalized(detectors, frame, name, full):
+@pytest.mark.parametrize("full_scale", [255, 65535])
+def test_other_intensity_scale_is_reported_and_normalized(detectors, frame, name, full_scale):
     scan, detector = frame.load(), detectors[name]
     assert scan.intensity.max() > 0.5
-    raw = np.column_stack([scan.xyz, np.round(scan.intensity * full)])
-    found, expected = detector(raw), detector(PointCloud.of(raw, intensity_max=full))
-    assert same(found.detections, expected.detections)
+    points = np.column_stack([scan.xyz, np.round(scan.intensity * full_scale)])
+    result, expected = detector(points), detector(PointCloud.of(points, intensity_max=full_scale))
+    assert same(result.detections, expected.detections)
     if name.startswith("STM-CPA") and "PointNet" not in name:  # these do not use intensity
-        assert found.problem == expected.problem
+        assert result.problem == expected.problem
     else:
-        assert f"full scale of {full} is assumed" in found.problem and "PointCloud.of" in found.problem
+        assert f"full scale of {full_scale} is assumed" in result.problem and "PointCloud.of" in result.problem
         assert "is assumed" not in (expected.problem or "")
 
 
@@ -106,18 +106,18 @@ def test_ego_vehicle_is_dropped_for_any_heading(seed):
     rng = np.random.default_rng(seed)
     boxes = np.column_stack([rng.uniform(-4, 4, (50, 3)), rng.uniform(0.5, 5, (50, 3)), rng.uniform(-4, 4, 50)])
     class_ids = np.arange(50) % len(CLASSES)
-    left = {tuple(box) for box in drop_ego_vehicle(Detections.of(boxes, class_ids), SENSOR_HEIGHT).boxes.tolist()}
+    remaining = {tuple(box) for box in drop_ego_vehicle(Detections.of(boxes, class_ids), SENSOR_HEIGHT).boxes.tolist()}
     angle = np.linspace(0, 2 * np.pi, 721)
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(721)])
     disc = np.concatenate([ring * share for share in np.linspace(0, 1, 21)])
     for box, class_id in zip(boxes, class_ids):
-        high = box + [0, 0, 0, 0, 0, 2.0, 0]
-        held = points_in_box(np.zeros((1, 3)), high)[0]
+        extended_box = box + [0, 0, 0, 0, 0, 2.0, 0]
+        is_dropped = points_in_box(np.zeros((1, 3)), extended_box)[0]
         if class_id == CAR and box[2] + box[5] / 2 < 0:
-            if points_in_box(disc, high).any() != points_in_box(1.02 * disc, high).any():
+            if points_in_box(disc, extended_box).any() != points_in_box(1.02 * disc, extended_box).any():
                 continue  # too close to the limit to be decided by points
-            held = points_in_box(disc, high).any()
-        assert (tuple(box.astype(np.float32).tolist()) in left) != held
+            is_dropped = points_in_box(disc, extended_box).any()
+        assert (tuple(box.astype(np.float32).tolist()) in remaining) != is_dropped
 
 
 @pytest.mark.parametrize(
@@ -126,19 +126,19 @@ def test_ego_vehicle_is_dropped_for_any_heading(seed):
 )
 def test_ego_vehicle_is_dropped_and_next_car_is_kept(pose):
     """The roof is detected in three parts, as in KITTI, for sensors up to MAX_MAST_M above the car."""
-    up = pose.height - SENSOR_HEIGHT
+    offset = pose.height - SENSOR_HEIGHT
     roof = np.array(
         [
-            [-0.2, 0.1, up - 1.0, 3.8, 1.6, 1.5, 0.9],
-            [0.8, -1.7, up - 1.0, 4.0, 1.7, 1.5, -0.1],
-            [-1.5, -0.2, up - 1.1, 4.0, 1.6, 1.5, 1.6],
+            [-0.2, 0.1, offset - 1.0, 3.8, 1.6, 1.5, 0.9],
+            [0.8, -1.7, offset - 1.0, 4.0, 1.7, 1.5, -0.1],
+            [-1.5, -0.2, offset - 1.1, 4.0, 1.6, 1.5, 1.6],
         ]
     )
-    other = [0.0, -2.8, up - 1.0, 4.0, 1.6, 1.5, 0.0]
-    found = restore_detections(Detections.of([*roof, other], CAR), pose).boxes
-    assert len(found) == 1 and abs(found[0, 1]) == np.float32(2.8)
-    low = Detections.of(roof - [0, 0, 4.3, 0, 0, 0, 0], CAR)
-    assert len(restore_detections(low, pose)) == 3
+    next_car = [0.0, -2.8, offset - 1.0, 4.0, 1.6, 1.5, 0.0]
+    boxes = restore_detections(Detections.of([*roof, next_car], CAR), pose).boxes
+    assert len(boxes) == 1 and abs(boxes[0, 1]) == np.float32(2.8)
+    low_cars = Detections.of(roof - [0, 0, 4.3, 0, 0, 0, 0], CAR)
+    assert len(restore_detections(low_cars, pose)) == 3
 
 
 def test_every_network_drops_the_ego_vehicle(detectors, frame, monkeypatch):
@@ -151,26 +151,26 @@ def test_every_network_drops_the_ego_vehicle(detectors, frame, monkeypatch):
 @each_name
 def test_second_call_is_equal_and_frame_unchanged(detectors, frame, name):
     scan = frame.load()
-    before = scan.xyz.copy(), scan.intensity.copy()
-    first, again = (detectors[name](scan) for _ in range(2))
-    assert isinstance(first, DetectionResult) and same(first, again)
-    assert (first.problem, first.best) == (again.problem, again.best)
-    assert first.timings.keys() == again.timings.keys()
-    assert {CLASSES[i] for i in first.detections.class_ids} <= set(detectors[name].classes)
-    np.testing.assert_array_equal(scan.xyz, before[0])
-    np.testing.assert_array_equal(scan.intensity, before[1])
+    original = scan.xyz.copy(), scan.intensity.copy()
+    result, second_result = (detectors[name](scan) for _ in range(2))
+    assert isinstance(result, DetectionResult) and same(result, second_result)
+    assert (result.problem, result.best) == (second_result.problem, second_result.best)
+    assert result.timings.keys() == second_result.timings.keys()
+    assert {CLASSES[i] for i in result.detections.class_ids} <= set(detectors[name].classes)
+    np.testing.assert_array_equal(scan.xyz, original[0])
+    np.testing.assert_array_equal(scan.intensity, original[1])
 
 
 @each_name
 def test_with_min_score_returns_a_copy(detectors, frame, name):
     detector, scan = detectors[name], frame.load()
-    before, scores = detector(scan), dict(detector.min_scores)
-    strict = detector.with_min_score(0.6)
-    assert type(strict) is type(detector) and strict.classes == detector.classes
-    assert set(strict.min_scores.values()) == {0.6}
-    assert (strict(scan).detections.scores >= np.float32(0.6)).all()
-    assert dict(detector.min_scores) == scores and same(detector(scan), before)
-    assert len(before.detections) > 0 or before.best
+    result, scores = detector(scan), dict(detector.min_scores)
+    strict_detector = detector.with_min_score(0.6)
+    assert type(strict_detector) is type(detector) and strict_detector.classes == detector.classes
+    assert set(strict_detector.min_scores.values()) == {0.6}
+    assert (strict_detector(scan).detections.scores >= np.float32(0.6)).all()
+    assert dict(detector.min_scores) == scores and same(detector(scan), result)
+    assert len(result.detections) > 0 or result.best
 
 
 @each_name

@@ -16,7 +16,7 @@ from safetensors.torch import save
 from lidar_perception.detectors.checkpoint import KEY, Header, read_header
 from lidar_perception.detectors.pointnet.config import make_pointnet_config
 from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
-from lidar_perception.detectors.pointnet.network import make_pointnet
+from lidar_perception.detectors.pointnet.network import PointNet
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
 from lidar_perception.detectors.pointpillars.detector import load_detector
 from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
@@ -66,33 +66,33 @@ ODD = [
 ]
 
 
-def write(path, tensors, header):
+def write_checkpoint(path, tensors, header):
     """Write a checkpoint with any text as its header."""
     path.write_bytes(save({name: value.contiguous() for name, value in tensors.items()}, {KEY: header}))
 
 
-def places(value, path=()):
+def list_key_paths(value, path=()):
     """Return the key paths of all values in a JSON object."""
     yield path
     if isinstance(value, dict | list):
         for key, part in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from places(part, (*path, key))
+            yield from list_key_paths(part, (*path, key))
 
 
-def mutated(header, rng):
+def mutate(header, rng):
     """Return a header with a few values changed, removed, added or nested deeper."""
     header = {"": copy.deepcopy(header)}
     for _ in range(rng.choice([1, 1, 1, 2, 5])):
-        *path, last = rng.choice([*places(header)][1:])
+        *path, last = rng.choice([*list_key_paths(header)][1:])
         parent = header
         for key in path:
             parent = parent[key]
-        kind = rng.randrange(4)
-        if kind == 0:
+        mutation = rng.randrange(4)
+        if mutation == 0:
             parent[last] = copy.deepcopy(rng.choice(ODD))
-        elif kind == 1 and path:
+        elif mutation == 1 and path:
             del parent[last]
-        elif kind == 2 and isinstance(parent, dict) and path:
+        elif mutation == 2 and isinstance(parent, dict) and path:
             parent[rng.choice(["", "size", "format", "a" * 99])] = copy.deepcopy(parent[last])
         else:
             parent[last] = rng.choice([[parent[last]], {"": parent[last]}])
@@ -105,22 +105,22 @@ SMALL = {
         lambda: Header(
             make_pointnet_config(points=16, centroids=8, coarse=4, neighbours=(4, 4, 4), coarse_neighbours=4)
         ),
-        make_pointnet,
+        PointNet,
         load_pointnet_detector,
         with_values(PointNetDetectorParams(), {"pointnet.warm_up": False}),
     ),
 }
 
 
-@pytest.mark.parametrize("kind", SMALL)
-def test_mutated_header_is_used_or_rejected_in_one_line(kind, tmp_path):
+@pytest.mark.parametrize("network_name", SMALL)
+def test_mutated_header_is_used_or_rejected_in_one_line(network_name, tmp_path):
     """Accepted headers match the shapes of the tensors, so the size of the file bounds the memory."""
-    make_header, make, load, params = SMALL[kind]
+    make_header, make, load, params = SMALL[network_name]
     header = make_header()
     tensors = make(header.config).state_dict()
     path, text, rng = tmp_path / "w.safetensors", json.loads(header.to_json()), random.Random(7)
-    scan, refused = frame(), 0
-    texts = [json.dumps(mutated(text, rng)) for _ in range(60)]
+    scan, rejected_count = frame(), 0
+    texts = [json.dumps(mutate(text, rng)) for _ in range(60)]
     texts += [
         "[" * 100_000,
         '{"format":' * 50_000,
@@ -130,27 +130,27 @@ def test_mutated_header_is_used_or_rejected_in_one_line(kind, tmp_path):
         "\ud83d".encode("utf-8", "replace").decode(),
         json.dumps({**text, "format": [1]}),
     ]
-    for one in texts:
-        write(path, tensors, one)
+    for header_text in texts:
+        write_checkpoint(path, tensors, header_text)
         try:
             read_header(path)
-            found = load(path, "cpu", params)(scan)
-            assert np.isfinite(found.detections.boxes).all()
+            result = load(path, "cpu", params)(scan)
+            assert np.isfinite(result.detections.boxes).all()
         except InputError as error:
-            refused += 1
+            rejected_count += 1
             assert str(path) in str(error) and "\n" not in str(error) and len(str(error)) < 400
-    assert 25 < refused < len(texts)
+    assert 25 < rejected_count < len(texts)
 
 
 def test_large_header_does_not_allocate_memory(tmp_path):
     header = json.loads(SMALL["pointpillars"][0]().to_json())
     header["config"]["block_channels"] = [65_536, 65_536, 65_536]  # 300 GB of weights
     path = tmp_path / "w.safetensors"
-    write(path, lively(tiny("v4")).state_dict(), json.dumps(header))
-    with pytest.raises(InputError, match="do not fit"):
+    write_checkpoint(path, lively(tiny("v4")).state_dict(), json.dumps(header))
+    with pytest.raises(InputError, match="do not match"):
         load_detector(path, "cpu")
     header["config"].update(low=[-60_000, -60_000, -3], high=[60_000, 60_000, 1], cell=0.01)
-    write(path, lively(tiny("v4")).state_dict(), json.dumps(header))
+    write_checkpoint(path, lively(tiny("v4")).state_dict(), json.dumps(header))
     with pytest.raises(InputError, match="cells"):
         load_detector(path, "cpu")
 
@@ -162,8 +162,8 @@ def test_constant_scores_are_reported_as_broken_weights():
         for tensor in network.state_dict().values():
             tensor.fill_(0)
         network.head.scores.bias.fill_(value)
-        found = make_detector(TorchNetwork(network), Header(config), eager(score=0.1))(frame())
-        assert len(found.detections) == 0 and "same scores" in found.problem
+        result = make_detector(TorchNetwork(network), Header(config), eager(score=0.1))(frame())
+        assert len(result.detections) == 0 and "scores are the same" in result.problem
 
 
 def test_onnx_files_with_other_inputs_are_rejected(tmp_path):
@@ -185,30 +185,30 @@ def test_onnx_files_with_other_inputs_are_rejected(tmp_path):
             [helper.make_tensor_value_info(*i) for i in inputs],
             [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1]) for name in outputs],
         )
-        made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
-        helper.set_model_props(made, {KEY: header} if header else {})
-        path.write_bytes(made.SerializeToString().replace(b"NO UTF-8", b"\xff" * 8))
+        onnx_model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+        helper.set_model_props(onnx_model, {KEY: header} if header else {})
+        path.write_bytes(onnx_model.SerializeToString().replace(b"NO UTF-8", b"\xff" * 8))
 
-    right = [
+    valid_inputs = [
         ("points", TensorProto.FLOAT, ["n", 4]),
         ("offsets", TensorProto.FLOAT, ["n", 5]),
         ("cells", TensorProto.INT64, ["n"]),
     ]
     assert onnx
     path = tmp_path / "n.onnx"
-    for change, words in (
-        (dict(inputs=[("pixels", *right[0][1:]), *right[1:]]), "do not match its header"),
-        (dict(inputs=right[:2]), "do not match its header"),
-        (dict(inputs=[("points", TensorProto.DOUBLE, ["n", 4]), *right[1:]]), "do not match its header"),
-        (dict(inputs=[("points", TensorProto.FLOAT, ["n"]), *right[1:]]), "do not match its header"),
-        (dict(inputs=right, outputs=("logits",)), "do not match its header"),
-        (dict(inputs=right, header="[" * 99_999), "no header"),
-        (dict(inputs=right, header=""), "no header"),
-        (dict(inputs=right, header="NO UTF-8"), "cannot read"),
-        (dict(inputs=right), "n.onnx"),
+    for change, message in (
+        (dict(inputs=[("pixels", *valid_inputs[0][1:]), *valid_inputs[1:]]), "do not match its header"),
+        (dict(inputs=valid_inputs[:2]), "do not match its header"),
+        (dict(inputs=[("points", TensorProto.DOUBLE, ["n", 4]), *valid_inputs[1:]]), "do not match its header"),
+        (dict(inputs=[("points", TensorProto.FLOAT, ["n"]), *valid_inputs[1:]]), "do not match its header"),
+        (dict(inputs=valid_inputs, outputs=("logits",)), "do not match its header"),
+        (dict(inputs=valid_inputs, header="[" * 99_999), "no lidar_perception header"),
+        (dict(inputs=valid_inputs, header=""), "no lidar_perception header"),
+        (dict(inputs=valid_inputs, header="NO UTF-8"), "cannot read"),
+        (dict(inputs=valid_inputs), "n.onnx"),
     ):  # outputs of impossible shapes
         model(path, **change)
-        with pytest.raises(InputError, match=words) as error:
+        with pytest.raises(InputError, match=message) as error:
             load_detector(path, "cpu")(frame())
         assert "\n" not in str(error.value)
 
@@ -217,10 +217,10 @@ def test_tensors_of_other_types_are_rejected(tmp_path):
     config = tiny("v4")
     path, state = tmp_path / "w.safetensors", lively(config).state_dict()
     for dtype in torch.bool, torch.int8, torch.complex64:
-        write(path, {name: value.to(dtype) for name, value in state.items()}, Header(config).to_json())
+        write_checkpoint(path, {name: value.to(dtype) for name, value in state.items()}, Header(config).to_json())
         with pytest.raises(InputError, match="expected floats of shape"):
             load_detector(path, "cpu", eager())
-    write(
+    write_checkpoint(
         path,
         {name: value.double() if value.is_floating_point() else value for name, value in state.items()},
         Header(config).to_json(),

@@ -31,36 +31,36 @@ def assert_alike(a: Detections, b: Detections, metres: float = 0.05, score: floa
     TF32, with three significant digits.
     """
     assert (a.scores > SURE).sum() > 3
-    for one, other in ((a, b), (b, a)):
-        for k in np.flatnonzero(one.scores > SURE + score):
-            apart = np.abs(other.boxes[:, :6] - one.boxes[k, :6]).max(axis=1)
-            apart[other.class_ids != one.class_ids[k]] = np.inf
-            same = int(apart.argmin())
-            assert apart[same] < metres and abs(other.scores[same] - one.scores[k]) < score
+    for detections, other in ((a, b), (b, a)):
+        for k in np.flatnonzero(detections.scores > SURE + score):
+            distances = np.abs(other.boxes[:, :6] - detections.boxes[k, :6]).max(axis=1)
+            distances[other.class_ids != detections.class_ids[k]] = np.inf
+            nearest = int(distances.argmin())
+            assert distances[nearest] < metres and abs(other.scores[nearest] - detections.scores[k]) < score
 
 
 @pytest.mark.parametrize("weights", DETECTORS, ids=lambda path: getattr(path, "stem", path))
 def test_detections_on_cuda_equal_those_on_cpu(weights, scan):
-    here, there = (open_detector(weights, device) for device in ("cpu", "cuda"))
-    found = there(scan)
-    assert found.problem is None and there.device == "cuda"
-    assert_alike(here(scan).detections, found.detections)
+    cpu_detector, cuda_detector = (open_detector(weights, device) for device in ("cpu", "cuda"))
+    result = cuda_detector(scan)
+    assert result.problem is None and cuda_detector.device == "cuda"
+    assert_alike(cpu_detector(scan).detections, result.detections)
 
 
 def test_detections_all_around_on_cuda_equal_those_on_cpu(scan):
-    here, there = (open_detector(device=device, range="around") for device in ("cpu", "cuda"))
-    assert_alike(here(scan).detections, there(scan).detections)
+    cpu_detector, cuda_detector = (open_detector(device=device, range="around") for device in ("cpu", "cuda"))
+    assert_alike(cpu_detector(scan).detections, cuda_detector(scan).detections)
 
 
 @pytest.mark.parametrize("weights", ["pointnet", "fused"])
 def test_cpu_fallback_is_reported(weights, scan):
     detector = open_detector(weights, "cuda")
-    on_cuda = detector(scan).detections
+    cuda_detections = detector(scan).detections
     torch.cuda.empty_cache()
     torch.cuda.set_per_process_memory_fraction(1e-6)
     try:
-        found = detector(scan)
+        result = detector(scan)
     finally:
         torch.cuda.set_per_process_memory_fraction(1.0)
-    assert "out of memory" in found.problem
-    assert_alike(on_cuda, found.detections)
+    assert "out of memory" in result.problem
+    assert_alike(cuda_detections, result.detections)

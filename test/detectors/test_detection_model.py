@@ -15,11 +15,11 @@ from lidar_perception.detectors.checkpoint import require_same_config
 from lidar_perception.detectors.config_json import parse_config
 from lidar_perception.detectors.pointpillars.anchors import decode
 from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS, NetworkConfig, make_config
-from lidar_perception.detectors.pointpillars.losses import detection_loss
+from lidar_perception.detectors.pointpillars.losses import compute_detection_loss
 from lidar_perception.detectors.pointpillars.network import fuse_norms, make_network
 from lidar_perception.detectors.pointpillars.pillar_batch import keep_first_per_cell, make_pillar_batch
 from lidar_perception.detectors.pointpillars.pillars import make_pillars
-from lidar_perception.detectors.pointpillars.targets import assign
+from lidar_perception.detectors.pointpillars.targets import assign_targets
 from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import InputError
@@ -30,18 +30,18 @@ pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("one_thread")]
 each_version = pytest.mark.parametrize("version", VERSIONS)
 
 
-def some_points(config, count=600, seed=0, margin=0.0) -> torch.Tensor:
+def make_points(config, count=600, seed=0, margin=0.0) -> torch.Tensor:
     """Return points in the entire range, enlarged by `margin`, a few in each pillar."""
     rng = torch.Generator().manual_seed(seed)
     low, high = torch.tensor(config.low) - margin, torch.tensor(config.high) + margin
     points = torch.rand(count, config.point_columns, generator=rng)
     points[:, :3] = low + points[:, :3] * (high - low)
-    near = points[: count - count // 2, :2]
-    points[count // 2 :, :2] = near + 0.002 * ((low + high)[:2] / 2 - near)
+    pillar_points = points[: count - count // 2, :2]
+    points[count // 2 :, :2] = pillar_points + 0.002 * ((low + high)[:2] / 2 - pillar_points)
     return points
 
 
-def some_map(config, seed=0) -> torch.Tensor | None:
+def make_map(config, seed=0) -> torch.Tensor | None:
     rng = torch.Generator().manual_seed(seed)
     return torch.randint(0, 2, (1, 3, *config.grid), generator=rng, dtype=torch.uint8) if config.pseudo_map else None
 
@@ -70,8 +70,8 @@ def test_versions_are_those_of_the_paper():
 
 def test_full_v0_has_as_many_weights_as_pointpillars():
     # 4.8 million: Lang et al. with three classes, six anchors and a direction
-    counted = sum(p.numel() for p in make_network(make_config("v0", "full")).parameters())
-    by_hand = (
+    count = sum(p.numel() for p in make_network(make_config("v0", "full")).parameters())
+    expected = (
         9 * 64
         + 2 * 64  # points
         + sum(
@@ -81,13 +81,13 @@ def test_full_v0_has_as_many_weights_as_pointpillars():
         + sum(c * 128 * s * s + 2 * 128 for c, s in ((64, 1), (128, 2), (256, 4)))
         + 385 * 6 * (3 + 7 + 2)
     )  # head
-    assert counted == by_hand
+    assert count == expected
 
 
 @pytest.mark.parametrize(
     "change, words",
     [
-        (dict(version="v9"), "no 'v9'"),
+        (dict(version="v9"), "unknown version 'v9'"),
         (dict(classes=("Dog",)), "Dog"),
         (dict(classes=()), "class"),
         (dict(cell=0.17), "cannot be divided"),
@@ -109,37 +109,37 @@ def test_error_for_another_network_shows_both_values():
 
 def test_pillars_contain_their_points():
     config = tiny("v0")
-    points = some_points(config, margin=1.0)
+    points = make_points(config, margin=1.0)
     points[3, 0], points[4, 2], points[5, 3] = torch.nan, torch.inf, torch.nan
     pillars = make_pillar_batch([points], config)
     low, high = torch.tensor(config.low), torch.tensor(config.high)
-    inside = ((points[:, :3] >= low) & (points[:, :3] < high)).all(1) & points.isfinite().all(1)
-    assert torch.equal(pillars.points, points[inside]) and 0 < inside.sum() < len(points) - 3
+    in_range = ((points[:, :3] >= low) & (points[:, :3] < high)).all(1) & points.isfinite().all(1)
+    assert torch.equal(pillars.points, points[in_range]) and 0 < in_range.sum() < len(points) - 3
     height, width = config.grid
     assert pillars.cells.min() >= 0 and pillars.cells.max() < height * width
     for cell in pillars.cells.unique():
         members = pillars.cells == cell
         xyz, offsets = pillars.points[members][:, :3], pillars.offsets[members]
-        middle = low[:2] + (torch.stack([cell % width, cell // width]) + 0.5) * config.cell
+        centre = low[:2] + (torch.stack([cell % width, cell // width]) + 0.5) * config.cell
         torch.testing.assert_close(offsets[:, :3], xyz - xyz.mean(0), atol=1e-5, rtol=0)
-        torch.testing.assert_close(offsets[:, 3:], xyz[:, :2] - middle, atol=1e-5, rtol=0)
+        torch.testing.assert_close(offsets[:, 3:], xyz[:, :2] - centre, atol=1e-5, rtol=0)
         assert offsets[:, 3:].abs().max() <= config.cell / 2 + 1e-5
 
 
 @given(seeds, st.integers(1, 5))
-def test_keep_first_per_cell_equals_a_loop(seed, most):
+def test_keep_first_per_cell_equals_a_loop(seed, max_count):
     cells = torch.from_numpy(np.random.default_rng(seed).integers(0, 9, 50))
-    counts, kept = {}, []
+    counts, indices = {}, []
     for i, cell in enumerate(cells.tolist()):
         counts[cell] = counts.get(cell, 0) + 1
-        if counts[cell] <= most:
-            kept.append(i)
-    assert keep_first_per_cell(cells, most).tolist() == kept
+        if counts[cell] <= max_count:
+            indices.append(i)
+    assert keep_first_per_cell(cells, max_count).tolist() == indices
 
 
 def test_the_order_of_the_points_makes_no_difference():
     config = tiny("v0")
-    network, points = lively(config), some_points(config)
+    network, points = lively(config), make_points(config)
     image = network.pillar_net(make_pillar_batch([points], config))
     shuffled = network.pillar_net(make_pillar_batch([points[torch.randperm(len(points))]], config))
     torch.testing.assert_close(shuffled, image, atol=1e-5, rtol=1e-5)
@@ -149,52 +149,52 @@ def test_the_order_of_the_points_makes_no_difference():
 def test_points_stay_float32_in_mixed_precision():
     config = tiny()
     network = lively(config)
-    pillars = make_pillar_batch([some_points(config)], config)
-    whole = network.pillar_net(pillars)
+    pillars = make_pillar_batch([make_points(config)], config)
+    expected = network.pillar_net(pillars)
     with torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(network.pillar_net(pillars), whole)
-        assert network.features(pillars).dtype == torch.bfloat16
+        assert torch.equal(network.pillar_net(pillars), expected)
+        assert network.compute_features(pillars).dtype == torch.bfloat16
 
 
 def test_bf16_network_agrees_with_float32():
     config = tiny()
-    pillars = make_pillars(some_points(config).numpy(), config)
-    said = {}
+    pillars = make_pillars(make_points(config).numpy(), config)
+    outputs = {}
     for amp in ("off", "bf16"):
-        logits, boxes_at, _ = TorchNetwork(lively(config), amp=amp)(pillars, None)
-        said[amp] = np.column_stack([logits, *boxes_at(np.arange(len(logits)))])
-    assert said["bf16"].dtype == np.float32 and not np.array_equal(said["bf16"], said["off"])
-    assert np.abs(said["bf16"] - said["off"]).max() < 0.05 * np.abs(said["off"]).max()
+        logits, compute_boxes, _ = TorchNetwork(lively(config), amp=amp)(pillars, None)
+        outputs[amp] = np.column_stack([logits, *compute_boxes(np.arange(len(logits)))])
+    assert outputs["bf16"].dtype == np.float32 and not np.array_equal(outputs["bf16"], outputs["off"])
+    assert np.abs(outputs["bf16"] - outputs["off"]).max() < 0.05 * np.abs(outputs["off"]).max()
 
 
 def test_shift_by_one_pillar_shifts_image_by_one_cell():
     config = tiny("v0", low=(0.0, -4.0, -3.0), high=(8.0, 4.0, 1.0), cell=0.25)
     network = lively(config)
     network.pillar_net.linear.weight[:, :2] = 0  # x and y themselves
-    points = (some_points(config) * 64).round() / 64  # so that shifts are exact
+    points = (make_points(config) * 64).round() / 64  # so that shifts are exact
     points = points[(points[:, 0] < 7.5) & (points[:, 1] < 3.5)]
     image = network.pillar_net(make_pillar_batch([points], config))
     for axis, (rows, columns) in ((0, (0, 1)), (1, (1, 0))):
-        moved = points.clone()
-        moved[:, axis] += 0.25
-        shifted = network.pillar_net(make_pillar_batch([moved], config))
-        torch.testing.assert_close(shifted, image.roll((rows, columns), (2, 3)), atol=1e-5, rtol=0)
+        shifted_points = points.clone()
+        shifted_points[:, axis] += 0.25
+        shifted_image = network.pillar_net(make_pillar_batch([shifted_points], config))
+        torch.testing.assert_close(shifted_image, image.roll((rows, columns), (2, 3)), atol=1e-5, rtol=0)
 
 
 def test_smaller_x_and_y_need_larger_weights():
     config = tiny("v2", xy_scale=1.0)
-    plain, small = lively(config), lively(dataclasses.replace(config, xy_scale=0.125))
-    small.load_state_dict(plain.state_dict())
-    pillars = make_pillar_batch([some_points(config)], config)
-    assert not torch.allclose(small.pillar_net(pillars), plain.pillar_net(pillars), atol=0.1)
-    small.pillar_net.linear.weight[:, :2] *= 8
-    torch.testing.assert_close(small.pillar_net(pillars), plain.pillar_net(pillars))
+    network, scaled_network = lively(config), lively(dataclasses.replace(config, xy_scale=0.125))
+    scaled_network.load_state_dict(network.state_dict())
+    pillars = make_pillar_batch([make_points(config)], config)
+    assert not torch.allclose(scaled_network.pillar_net(pillars), network.pillar_net(pillars), atol=0.1)
+    scaled_network.pillar_net.linear.weight[:, :2] *= 8
+    torch.testing.assert_close(scaled_network.pillar_net(pillars), network.pillar_net(pillars))
 
 
 @pytest.mark.parametrize("middle_z", [False, True])
 def test_limited_number_of_pillars_equals_padding(middle_z):
     config = tiny("v0", max_points=2, zero_row=True, middle_z=middle_z, xy_scale=1.0)
-    network, points = lively(config), some_points(config, 900)
+    network, points = lively(config), make_points(config, 900)
     net, low = network.pillar_net, torch.tensor(config.low)
     image = net(make_pillar_batch([points], config))[0]
     expected = torch.zeros_like(image)
@@ -202,12 +202,12 @@ def test_limited_number_of_pillars_equals_padding(middle_z):
     for column, row in set(map(tuple, cells.tolist())):
         members = points[(cells == torch.tensor([column, row])).all(1)][:2]
         rows = torch.zeros(2, 9 + middle_z)  # padded with zeros, which take part in the maximum
-        middle = [*(low[:2] + (torch.tensor([column, row]) + 0.5) * config.cell), -1.0]
+        centre = [*(low[:2] + (torch.tensor([column, row]) + 0.5) * config.cell), -1.0]
         rows[: len(members)] = torch.cat(
             [
                 members,
                 members[:, :3] - members[:, :3].mean(0),
-                (members[:, :3] - torch.tensor(middle))[:, : 2 + middle_z],
+                (members[:, :3] - torch.tensor(centre))[:, : 2 + middle_z],
             ],
             dim=1,
         )
@@ -224,46 +224,46 @@ def test_every_version_has_outputs_for_all_anchors(version, changes):
     config = tiny(version, **changes)
     count = len(anchor_tensors(config)[0])
     assert count == config.head_grid[0] * config.head_grid[1] * 6
-    pillars = make_pillar_batch([some_points(config), some_points(config, 9)], config)
-    out = make_network(config)(pillars, torch.cat([some_map(config)] * 2) if config.pseudo_map else None)
-    assert [tuple(t.shape) for t in out] == [(2, count, 3), (2, count, 7), (2, count, 2)]
-    assert torch.sigmoid(out.logits).mean().item() == pytest.approx(0.01, rel=0.2)  # untrained
+    pillars = make_pillar_batch([make_points(config), make_points(config, 9)], config)
+    outputs = make_network(config)(pillars, torch.cat([make_map(config)] * 2) if config.pseudo_map else None)
+    assert [tuple(t.shape) for t in outputs] == [(2, count, 3), (2, count, 7), (2, count, 2)]
+    assert torch.sigmoid(outputs.logits).mean().item() == pytest.approx(0.01, rel=0.2)  # untrained
 
 
 @each_version
 def test_batch_of_two_equals_two_single_clouds(version):
     config = tiny(version)
     network = lively(config)
-    clouds = [some_points(config, 300, 1), some_points(config, 500, 2)]
-    maps = [some_map(config, 1), some_map(config, 2)]
-    both = network(make_pillar_batch(clouds, config), torch.cat(maps) if config.pseudo_map else None)
+    clouds = [make_points(config, 300, 1), make_points(config, 500, 2)]
+    maps = [make_map(config, 1), make_map(config, 2)]
+    batch_outputs = network(make_pillar_batch(clouds, config), torch.cat(maps) if config.pseudo_map else None)
     for i in range(2):
-        alone = network(make_pillar_batch(clouds[i : i + 1], config), maps[i])
-        for one, batch in zip(alone, both):
-            torch.testing.assert_close(one[0], batch[i], atol=2e-5, rtol=1e-4)
-    assert not torch.allclose(both.logits[0], both.logits[1], atol=1e-3)
+        single_outputs = network(make_pillar_batch(clouds[i : i + 1], config), maps[i])
+        for single, batch in zip(single_outputs, batch_outputs):
+            torch.testing.assert_close(single[0], batch[i], atol=2e-5, rtol=1e-4)
+    assert not torch.allclose(batch_outputs.logits[0], batch_outputs.logits[1], atol=1e-3)
 
 
 @each_version
 def test_folding_the_norms_changes_nothing(version):
     config = tiny(version)
     network = lively(config)
-    pillars, cluster_map = make_pillar_batch([some_points(config)], config), some_map(config)
+    pillars, cluster_map = make_pillar_batch([make_points(config)], config), make_map(config)
     folded = fuse_norms(network)
     for a, b in zip(network(pillars, cluster_map), folded(pillars, cluster_map)):
         torch.testing.assert_close(a, b, atol=2e-5, rtol=1e-4)
     assert not [m for m in folded.modules() if isinstance(m, torch.nn.BatchNorm2d)]
 
 
-def test_boxes_at_chosen_anchors_equal_those_of_all():
+def test_boxes_at_some_anchors_equal_those_at_all():
     config = tiny("v1")
     network = lively(config)
-    features = network.features(make_pillar_batch([some_points(config)], config))
-    out, some = network.head(features), torch.tensor([0, 5, 17, 100, 1535])
-    codes, directions = network.head.boxes_at(features, some)
-    torch.testing.assert_close(codes, out.codes[0, some], atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(directions, out.directions[0, some], atol=1e-5, rtol=1e-4)
-    assert torch.equal(network.head.logits(features), out.logits)
+    features = network.compute_features(make_pillar_batch([make_points(config)], config))
+    outputs, indices = network.head(features), torch.tensor([0, 5, 17, 100, 1535])
+    codes, directions = network.head.compute_boxes(features, indices)
+    torch.testing.assert_close(codes, outputs.codes[0, indices], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(directions, outputs.directions[0, indices], atol=1e-5, rtol=1e-4)
+    assert torch.equal(network.head.compute_logits(features), outputs.logits)
 
 
 def test_a_tiny_network_learns_two_objects():
@@ -273,34 +273,38 @@ def test_a_tiny_network_learns_two_objects():
     for module in network.modules():
         if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
             module.momentum = 0.1
-    anchors, kinds = anchor_tensors(config)
-    targets = assign(anchors, config, BOXES, LABELS)
+    anchors, anchor_classes = anchor_tensors(config)
+    targets = assign_targets(anchors, config, BOXES, LABELS)
     points = torch.from_numpy(two_objects())
     optimizer = torch.optim.AdamW(network.parameters())
-    rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, 0.02, total_steps=200)
+    scheduler = torch.optim.lr_scheduler.OneCycleLR(optimizer, 0.02, total_steps=200)
     for _ in range(200):
-        losses = detection_loss(network(make_pillar_batch([points], config)), targets, kinds)
+        losses = compute_detection_loss(network(make_pillar_batch([points], config)), targets, anchor_classes)
         optimizer.zero_grad()
         losses.total.backward()
         optimizer.step()
-        rate.step()
+        scheduler.step()
     with torch.no_grad():
-        out = fuse_norms(network)(make_pillar_batch([points], config))
-    scores = torch.sigmoid(out.logits[0])
+        outputs = fuse_norms(network)(make_pillar_batch([points], config))
+    scores = torch.sigmoid(outputs.logits[0])
     for box, label in zip(BOXES, LABELS):
-        best = scores[:, label].argmax()
-        found = torch.from_numpy(
+        best_anchor = scores[:, label].argmax()
+        decoded = torch.from_numpy(
             decode(
                 *(
                     values[None].numpy()
-                    for values in (out.codes[0, best], out.directions[0, best].argmax(), anchors[best])
+                    for values in (
+                        outputs.codes[0, best_anchor],
+                        outputs.directions[0, best_anchor].argmax(),
+                        anchors[best_anchor],
+                    )
                 ),
                 config.direction_offset,
             )[0]
         )
-        assert scores[best, label] > 0.9
-        torch.testing.assert_close(found[:6], box[:6], atol=0.2, rtol=0)
-        assert abs(wrap_angle((found[6] - box[6]).item())) < 0.2
+        assert scores[best_anchor, label] > 0.9
+        torch.testing.assert_close(decoded[:6], box[:6], atol=0.2, rtol=0)
+        assert abs(wrap_angle((decoded[6] - box[6]).item())) < 0.2
     assert (scores.amax(1) > 0.5).sum() <= 2 * (targets.labels >= 0).sum()
 
 

@@ -37,18 +37,18 @@ def test_given_columns_equal_computed_columns(version):
     scan = frame()
     config = detector.proposer.config
     view = NormalizedView.of(scan, low=config.low, high=config.high)
-    indices, seen = view.indices, view.frame
-    flat = np.zeros(len(scan), bool)
-    flat[indices] = segment_ground(seen, EXPERT_GROUND)
+    indices, view_frame = view.indices, view.frame
+    ground = np.zeros(len(scan), bool)
+    ground[indices] = segment_ground(view_frame, EXPERT_GROUND)
     ids = np.zeros(len(scan), np.uint32)
-    obstacles = indices[~flat[indices]]
-    ids[obstacles] = cluster(scan.xyz[obstacles], EXPERT_CLUSTERING, measure_density(seen.xyz))
+    obstacles = indices[~ground[indices]]
+    ids[obstacles] = cluster(scan.xyz[obstacles], EXPERT_CLUSTERING, measure_density(view_frame.xyz))
     ids[ids > 0] *= 3  # ids need not be consecutive
-    assert flat.any() and ids.max() >= 6
+    assert ground.any() and ids.max() >= 6
     computed = detector(scan)
     assert len(computed.detections) > 3
-    for ground, cluster_ids in (flat, None), (None, ids), (flat.astype(np.uint8), ids):
-        assert same(detector(scan, ground=ground, cluster_ids=cluster_ids), computed)
+    for columns in (ground, None), (None, ids), (ground.astype(np.uint8), ids):
+        assert same(detector(scan, ground=columns[0], cluster_ids=columns[1]), computed)
 
 
 def test_versions_have_the_inputs_of_the_paper():
@@ -56,22 +56,22 @@ def test_versions_have_the_inputs_of_the_paper():
     inputs = {}
     for version in VERSIONS:
         config = tiny(version)
-        seen = NormalizedView.of(scan, low=config.low, high=config.high).frame
-        inputs[version] = make_network_input(seen, config)
-    flat = segment_ground(seen, EXPERT_GROUND)
+        view_frame = NormalizedView.of(scan, low=config.low, high=config.high).frame
+        inputs[version] = make_network_input(view_frame, config)
+    ground = segment_ground(view_frame, EXPERT_GROUND)
     assert [i.points.shape[1] for i in inputs.values()] == [4, 4, 5, 5, 4]
     assert [i.cluster_map is not None for i in inputs.values()] == [False] * 4 + [True]
-    for version, kept in (
-        ("v0", np.ones(len(seen), bool)),
-        ("v1", ~flat),
-        ("v2", ~flat),
-        ("v3", np.ones(len(seen), bool)),
-        ("v4", ~flat),
+    for version, mask in (
+        ("v0", np.ones(len(view_frame), bool)),
+        ("v1", ~ground),
+        ("v2", ~ground),
+        ("v3", np.ones(len(view_frame), bool)),
+        ("v4", ~ground),
     ):
-        np.testing.assert_array_equal(inputs[version].points[:, :3], seen.xyz[kept])
-        np.testing.assert_array_equal(inputs[version].points[:, 3], seen.intensity[kept])
-    np.testing.assert_array_equal(inputs["v3"].points[~flat], inputs["v2"].points)
-    assert not inputs["v3"].points[flat, 4].any()
+        np.testing.assert_array_equal(inputs[version].points[:, :3], view_frame.xyz[mask])
+        np.testing.assert_array_equal(inputs[version].points[:, 3], view_frame.intensity[mask])
+    np.testing.assert_array_equal(inputs["v3"].points[~ground], inputs["v2"].points)
+    assert not inputs["v3"].points[ground, 4].any()
     ids = inputs["v2"].points[:, 4]
     assert {*np.unique(ids)} >= {1, 2} and ids.max() == len(np.unique(ids[ids > 0]))
 
@@ -82,27 +82,27 @@ MAP_CLASSES = ("Car", "Cyclist", "Pedestrian")  # by the channels of paper B
 def test_cluster_map_equals_a_plain_loop_over_cells():
     config = tiny("v4", cell=0.16)
     rng = np.random.default_rng(4)
-    spots = rng.uniform([0, -6, 0], [10.5, 6, 0], (25, 3))
+    centres = rng.uniform([0, -6, 0], [10.5, 6, 0], (25, 3))
     spread = np.linspace(0.02, 3, 25)[:, None, None]
-    xyz = (spots[:, None] + rng.normal(size=(25, 40, 3)) * spread * 0.5).reshape(-1, 3)
+    xyz = (centres[:, None] + rng.normal(size=(25, 40, 3)) * spread * 0.5).reshape(-1, 3)
     xyz, ids = xyz.astype(np.float32), np.repeat(np.arange(25), 40).astype(np.int32)  # 0: no cluster
-    kinds = classify_by_diagonal(fit_boxes(xyz, ids, "min_area"))
-    assert {*kinds} == {-1, *(CLASSES.index(n) for n in MAP_CLASSES)}
+    class_ids = classify_by_diagonal(fit_boxes(xyz, ids, "min_area"))
+    assert {*class_ids} == {-1, *(CLASSES.index(n) for n in MAP_CLASSES)}
     expected = np.zeros((3, *config.grid), np.uint8)
     y, x = np.meshgrid(
         *(low + (np.arange(n) + 0.5) * 0.16 for low, n in zip((config.low[1], config.low[0]), config.grid)),
         indexing="ij",
     )
-    for kind, (cx, cy, a, b, yaw) in zip(kinds, fit_ellipses(xyz, ids).astype(float)):
-        if kind < 0:
+    for class_id, (cx, cy, a, b, yaw) in zip(class_ids, fit_ellipses(xyz, ids).astype(float)):
+        if class_id < 0:
             continue
         u = np.cos(yaw) * (x - cx) + np.sin(yaw) * (y - cy)
         v = np.cos(yaw) * (y - cy) - np.sin(yaw) * (x - cx)
-        centre = np.maximum(abs(x - cx), abs(y - cy)) <= 0.08
-        expected[MAP_CLASSES.index(CLASSES[kind])] |= ((u / a) ** 2 + (v / b) ** 2 <= 1) | centre
-    drawn = draw_clusters(xyz, ids, config)
-    assert (drawn != expected).sum() <= 2  # cells whose centre is on the edge of an ellipse
-    assert drawn.shape == (3, 64, 64) and all(layer.any() for layer in drawn)
+        contains_centre = np.maximum(abs(x - cx), abs(y - cy)) <= 0.08
+        expected[MAP_CLASSES.index(CLASSES[class_id])] |= ((u / a) ** 2 + (v / b) ** 2 <= 1) | contains_centre
+    image = draw_clusters(xyz, ids, config)
+    assert (image != expected).sum() <= 2  # cells whose centre is on the edge of an ellipse
+    assert image.shape == (3, 64, 64) and all(layer.any() for layer in image)
 
 
 def test_collinear_cluster_is_drawn_at_its_centre():
@@ -119,69 +119,69 @@ def test_view_does_not_depend_on_sensor_height():
     config, rng = tiny(), np.random.default_rng(0)
     scan = PointCloud(rng.uniform([-2, -7, -6], [12, 7, 5], (500, 3)).astype(np.float32))
     view = NormalizedView.of(scan, low=config.low, high=config.high)
-    higher = replace(scan, xyz=scan.xyz - np.float32([0, 0, 0.5]))
-    again = NormalizedView.of(higher, SensorPoseParams(height=2.23), config.low, config.high)
-    assert view.indices.tolist() == again.indices.tolist() and 50 < len(view) < 450
-    np.testing.assert_allclose(again.frame.xyz, view.frame.xyz, atol=1e-5)
+    higher_scan = replace(scan, xyz=scan.xyz - np.float32([0, 0, 0.5]))
+    higher_view = NormalizedView.of(higher_scan, SensorPoseParams(height=2.23), config.low, config.high)
+    assert view.indices.tolist() == higher_view.indices.tolist() and 50 < len(view) < 450
+    np.testing.assert_allclose(higher_view.frame.xyz, view.frame.xyz, atol=1e-5)
     low, high = np.array(config.low), np.array(config.high)
     assert (view.frame.xyz >= low).all() and (view.frame.xyz < high).all()
 
 
 def test_detections_pass_thresholds_sorted_without_overlap():
     detector = random_detector("v4")
-    said = detector(frame())
-    found = said.detections
-    assert (np.diff(found.scores) <= 0).all() and (found.scores >= 0.25).all()
-    assert {*found.class_ids} <= {CLASSES.index(n) for n in detector.classes}
-    assert said.problem is None and list(said.timings) == list(STEPS)
-    assert said.timings["network"] > 0
-    middle = float(np.median(found.scores[found.class_ids == found.class_ids[0]]))
-    name = CLASSES[found.class_ids[0]].lower()
-    detector.params = with_values(detector.params, {f"pointpillars.scores.{name}": middle})
-    fewer = detector(frame()).detections
-    assert fewer.scores[fewer.class_ids == found.class_ids[0]].min() >= middle
+    result = detector(frame())
+    detections = result.detections
+    assert (np.diff(detections.scores) <= 0).all() and (detections.scores >= 0.25).all()
+    assert {*detections.class_ids} <= {CLASSES.index(n) for n in detector.classes}
+    assert result.problem is None and list(result.timings) == list(STEPS)
+    assert result.timings["network"] > 0
+    median_score = float(np.median(detections.scores[detections.class_ids == detections.class_ids[0]]))
+    name = CLASSES[detections.class_ids[0]].lower()
+    detector.params = with_values(detector.params, {f"pointpillars.scores.{name}": median_score})
+    remaining = detector(frame()).detections
+    assert remaining.scores[remaining.class_ids == detections.class_ids[0]].min() >= median_score
     detector.params = with_values(detector.params, {"pointpillars.nms.max_boxes": 2})
-    assert same(detector(frame()), fewer[:2])
+    assert same(detector(frame()), remaining[:2])
 
 
 def test_sensor_height_only_shifts_boxes():
     detector = random_detector("v4")
-    scan, found = frame(), detector(frame()).detections
-    higher = replace(scan, xyz=scan.xyz - np.array([0, 0, 0.5], np.float32))
+    scan, expected = frame(), detector(frame()).detections
+    higher_scan = replace(scan, xyz=scan.xyz - np.array([0, 0, 0.5], np.float32))
     detector.params = with_values(detector.params, {"ground.sensor_pose.height": 2.23})
-    moved = detector(higher).detections
-    assert same(replace(moved, boxes=moved.boxes + np.float32([0, 0, 0.5, 0, 0, 0, 0])), found, 1e-3)
+    detections = detector(higher_scan).detections
+    assert same(replace(detections, boxes=detections.boxes + np.float32([0, 0, 0.5, 0, 0, 0, 0])), expected, 1e-3)
 
 
 @pytest.mark.parametrize("roll, pitch", [(3.1416, 0.0), (0.0, 0.2), (0.1, -0.1)])
 def test_tilted_sensor_gives_the_same_boxes_in_its_frame(roll, pitch):
     pose = SensorPoseParams(roll=roll, pitch=pitch)
-    turn = level_points(np.eye(3, dtype=np.float32), pose)  # rows: the sensor's axes when level
-    found = Detections.of([[8, 2, -1, 4, 2, 1.5, 0.7]], scores=[0.5])
-    box = to_sensor_frame(found, pose).boxes[0]
-    np.testing.assert_allclose(box[:3] @ turn, [8, 2, -1], atol=1e-5)
-    forward = np.array([np.cos(box[6]), np.sin(box[6]), 0]) @ turn
+    rotation = level_points(np.eye(3, dtype=np.float32), pose)  # rows: the sensor's axes when level
+    detections = Detections.of([[8, 2, -1, 4, 2, 1.5, 0.7]], scores=[0.5])
+    box = to_sensor_frame(detections, pose).boxes[0]
+    np.testing.assert_allclose(box[:3] @ rotation, [8, 2, -1], atol=1e-5)
+    forward = np.array([np.cos(box[6]), np.sin(box[6]), 0]) @ rotation
     assert forward[:2] @ [np.cos(0.7), np.sin(0.7)] > 0.97  # yaw is about the sensor's own z
-    assert same(to_sensor_frame(found, SensorPoseParams()), found)
+    assert same(to_sensor_frame(detections, SensorPoseParams()), detections)
 
 
 def test_intensity_is_normalized_and_may_be_left_out():
     detector, scan = random_detector(), frame()
-    found = detector(scan)
-    assert same(detector(replace(scan, intensity=scan.intensity / 2)), found)
-    other = replace(scan, intensity=scan.intensity[::-1].copy())
-    assert not same(detector(other), found)
-    without = detector(replace(scan, intensity=None))
-    assert "no intensity" in without.problem
-    half = np.where(np.arange(len(scan)) % 2, np.float32(np.nan), scan.intensity)
-    assert "their intensity is NaN" in detector(replace(scan, intensity=half)).problem
+    expected = detector(scan)
+    assert same(detector(replace(scan, intensity=scan.intensity / 2)), expected)
+    reversed_scan = replace(scan, intensity=scan.intensity[::-1].copy())
+    assert not same(detector(reversed_scan), expected)
+    without_intensity = detector(replace(scan, intensity=None))
+    assert "no intensity" in without_intensity.problem
+    nan_intensity = np.where(np.arange(len(scan)) % 2, np.float32(np.nan), scan.intensity)
+    assert "their intensity is NaN" in detector(replace(scan, intensity=nan_intensity)).problem
     detector.params = with_values(detector.params, {"pointpillars.use_intensity": False})
-    for blind in scan, replace(scan, intensity=None), replace(scan, intensity=half):
-        assert same(detector(blind), without) and detector(blind).problem is None
+    for cloud in scan, replace(scan, intensity=None), replace(scan, intensity=nan_intensity):
+        assert same(detector(cloud), without_intensity) and detector(cloud).problem is None
 
 
 @pytest.mark.parametrize(
-    "xyz, words",
+    "xyz, message",
     [
         (np.zeros((0, 3)), "empty"),
         (np.full((5, 3), np.nan), "network's range"),
@@ -189,34 +189,34 @@ def test_intensity_is_normalized_and_may_be_left_out():
     ],
 )
 @pytest.mark.parametrize("version", ["v0", "v4"])
-def test_empty_cloud_has_no_detections_and_a_problem(version, xyz, words):
+def test_empty_cloud_has_no_detections_and_a_problem(version, xyz, message):
     detector = random_detector(version)
-    found = detector(PointCloud(np.asarray(xyz, np.float32)))
-    assert len(found.detections) == 0 and words in found.problem and found.timings["network"] == 0
+    result = detector(PointCloud(np.asarray(xyz, np.float32)))
+    assert len(result.detections) == 0 and message in result.problem and result.timings["network"] == 0
     assert detector(frame()).problem is None
 
 
 def test_ground_only_cloud_has_a_problem():
     detector, scan = random_detector("v4"), frame()
-    found = detector(scan, ground=np.ones(len(scan), bool))
-    assert len(found.detections) == 0 and "ground.sensor_pose" in found.problem
+    result = detector(scan, ground=np.ones(len(scan), bool))
+    assert len(result.detections) == 0 and "ground.sensor_pose" in result.problem
 
 
 def test_best_scores_are_reported_without_detections():
     detector, scan = random_detector("v4", eager(score=0.0)), frame()
     assert detector(scan).best == {}
-    found = detector(scan).detections
-    highest = {
-        name: float(found.scores[found.class_ids == CLASSES.index(name)].max())
+    detections = detector(scan).detections
+    best_scores = {
+        name: float(detections.scores[detections.class_ids == CLASSES.index(name)].max())
         for name in detector.classes
-        if CLASSES.index(name) in found.class_ids
+        if CLASSES.index(name) in detections.class_ids
     }
-    nothing = detector.with_min_score(1.0)(scan)
-    assert len(nothing.detections) == 0 and nothing.problem is None
-    assert list(nothing.best) == list(detector.classes)
-    assert max(nothing.best.values()) == pytest.approx(max(highest.values()))
-    assert all(nothing.best[name] >= score - 1e-6 for name, score in highest.items())
-    assert same(detector(scan), found)  # the copy does not change the original
+    result = detector.with_min_score(1.0)(scan)
+    assert len(result.detections) == 0 and result.problem is None
+    assert list(result.best) == list(detector.classes)
+    assert max(result.best.values()) == pytest.approx(max(best_scores.values()))
+    assert all(result.best[name] >= score - 1e-6 for name, score in best_scores.items())
+    assert same(detector(scan), detections)  # the copy does not change the original
     for parameter in detector.proposer.network.network.head.parameters():
         parameter.fill_(np.nan)
     assert "NaN" in detector(scan).problem
@@ -227,12 +227,12 @@ def test_huge_and_non_finite_clouds_are_handled():
     xyz = np.tile(scan.xyz, (250, 1))
     xyz[:5] = [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0], [1e9, 0, 0], [-np.inf, 0, np.nan]]
     assert len(xyz) > 900_000
-    found = detector(
+    result = detector(
         PointCloud(xyz, np.tile(scan.intensity, 250)),
         ground=np.zeros(len(xyz), bool),
         cluster_ids=np.tile(np.arange(len(scan)), 250),
     )
-    assert found.problem is None
+    assert result.problem is None
 
 
 def test_columns_of_wrong_length_are_rejected():
@@ -260,25 +260,25 @@ class OutOfMemory(TorchNetwork):
 
 def test_cpu_fallback_after_out_of_memory_is_reported():
     config, scan, meta = tiny(), frame(), "meta"
-    broken = make_detector(OutOfMemory(lively(config)), Header(config), eager(), meta)
+    detector = make_detector(OutOfMemory(lively(config)), Header(config), eager(), meta)
     for _ in range(2):
-        found = broken(scan)
-        assert same(found, random_detector()(scan)) and "CPU" in found.problem
-        assert broken.device == CPU
-    broken = make_detector(OutOfMemory(lively(config)), Header(config), eager(), meta)
-    others = broken.with_min_score(0.5), broken.with_raw_scores()  # these share the network
-    broken(scan)
-    assert all(other.device == CPU and "CPU" in other(scan).problem for other in others)
-    never = with_values(eager(), {"pointpillars.cpu_fallback": False})
+        result = detector(scan)
+        assert same(result, random_detector()(scan)) and "CPU" in result.problem
+        assert detector.device == CPU
+    detector = make_detector(OutOfMemory(lively(config)), Header(config), eager(), meta)
+    copies = detector.with_min_score(0.5), detector.with_raw_scores()  # these share the network
+    detector(scan)
+    assert all(copied_detector.device == CPU and "CPU" in copied_detector(scan).problem for copied_detector in copies)
+    params = with_values(eager(), {"pointpillars.cpu_fallback": False})
     with pytest.raises(InputError, match="out of memory"):
-        make_detector(OutOfMemory(lively(config)), Header(config), never, meta)(scan)
+        make_detector(OutOfMemory(lively(config)), Header(config), params, meta)(scan)
 
 
 @pytest.mark.parametrize(
-    "name, words", [("tpu", "no device 'tpu'"), ("mps", "no device 'mps'"), ("cuda:99", "CUDA device")]
+    "name, message", [("tpu", "unknown device 'tpu'"), ("mps", "unknown device 'mps'"), ("cuda:99", "CUDA device")]
 )
-def test_missing_device_is_rejected(name, words):
-    with pytest.raises(InputError, match=words):
+def test_missing_device_is_rejected(name, message):
+    with pytest.raises(InputError, match=message):
         find_device(name)
     assert find_device("cpu") == CPU
     assert find_device() == ("cuda" if torch.cuda.is_available() else "cpu")
@@ -290,5 +290,5 @@ def test_every_version_detects_cars_in_real_scans(data):
     scan = open_recording(data / "kitti_object").frames[0].load()
     for version in VERSIONS:
         config = make_config(version, "compact")
-        found = make_detector(TorchNetwork(lively(config)), Header(config))(scan)
-        assert found.problem is None and found.timings["network"] > 0
+        result = make_detector(TorchNetwork(lively(config)), Header(config))(scan)
+        assert result.problem is None and result.timings["network"] > 0

@@ -15,9 +15,9 @@ from pointnet_samples import random_detector as random_classifier
 
 from lidar_perception.classes import CAR
 from lidar_perception.detectors.boxes import (
-    FRONT,
+    FRONT_DEPTH,
     MARGIN_M,
-    SIDE,
+    SIDE_DEPTH,
     move_cars_to_points,
     move_to_ground,
     move_to_points,
@@ -50,7 +50,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 EAGER = FusedDetectorParams(fused=FusedParams(warm_up=False))
 
 
-def random_boxes(rng, count: int) -> np.ndarray:
+def make_random_boxes(rng, count: int) -> np.ndarray:
     return np.column_stack(
         [
             rng.uniform(-20, 20, (count, 2)),
@@ -66,24 +66,26 @@ def test_points_in_boxes_equals_points_in_each_box(seed, count, boxes, margin):
     rng = np.random.default_rng(seed)
     xyz = rng.uniform([-22, -22, -2], [22, 22, 2], (count, 3)).astype(np.float32)
     xyz[::50, rng.integers(3)] = rng.choice([np.nan, np.inf, -np.inf, 1e30])
-    boxes = random_boxes(rng, boxes).astype(np.float32)
+    boxes = make_random_boxes(rng, boxes).astype(np.float32)
     indices, first = points_in_boxes(xyz, boxes, margin)
     assert first[0] == 0 and first[-1] == len(indices) and len(first) == len(boxes) + 1
     for k, box in enumerate(boxes):
         np.testing.assert_array_equal(indices[first[k] : first[k + 1]], np.flatnonzero(points_in_box(xyz, box, margin)))
 
 
-def shell(box: np.ndarray, rng, count: int = 400) -> np.ndarray:
+def make_face_points(box: np.ndarray, rng, count: int = 400) -> np.ndarray:
     """Return points on the two faces of a box that a sensor at the origin sees."""
-    sensor = np.array([[np.cos(box[6]), np.sin(box[6])], [-np.sin(box[6]), np.cos(box[6])]]) @ (-box[:2])
-    flat = rng.uniform(-0.5, 0.5, (count, 3)) * box[3:6]
-    half = np.arange(count) < count // 2
-    for axis, depth in ((0, FRONT), (1, SIDE)):
-        own = half == (axis == 0)
-        flat[own, axis] = np.sign(sensor[axis]) * (box[3 + axis] / 2 - depth)
+    sensor_xy = np.array([[np.cos(box[6]), np.sin(box[6])], [-np.sin(box[6]), np.cos(box[6])]]) @ (-box[:2])
+    points = rng.uniform(-0.5, 0.5, (count, 3)) * box[3:6]
+    is_front_face = np.arange(count) < count // 2
+    for axis, depth in ((0, FRONT_DEPTH), (1, SIDE_DEPTH)):
+        on_face = is_front_face == (axis == 0)
+        points[on_face, axis] = np.sign(sensor_xy[axis]) * (box[3 + axis] / 2 - depth)
     cos, sin = np.cos(box[6]), np.sin(box[6])
     return (
-        np.column_stack([cos * flat[:, 0] - sin * flat[:, 1], sin * flat[:, 0] + cos * flat[:, 1], flat[:, 2]])
+        np.column_stack(
+            [cos * points[:, 0] - sin * points[:, 1], sin * points[:, 0] + cos * points[:, 1], points[:, 2]]
+        )
         + box[:3]
     )
 
@@ -91,54 +93,62 @@ def shell(box: np.ndarray, rng, count: int = 400) -> np.ndarray:
 @given(SEEDS)
 def test_move_to_points_corrects_shifted_car_only(seed):
     rng = np.random.default_rng(seed)
-    away = rng.uniform(8, 30)
-    way = rng.uniform(-np.pi, np.pi)
+    distance = rng.uniform(8, 30)
+    azimuth = rng.uniform(-np.pi, np.pi)
     box = np.array(
-        [away * np.cos(way), away * np.sin(way), -0.9, 4.0, 1.7, 1.5, way + rng.choice([-1, 1]) * rng.uniform(0.6, 0.9)]
+        [
+            distance * np.cos(azimuth),
+            distance * np.sin(azimuth),
+            -0.9,
+            4.0,
+            1.7,
+            1.5,
+            azimuth + rng.choice([-1, 1]) * rng.uniform(0.6, 0.9),
+        ]
     )  # two faces are visible
-    points = shell(box, rng)
-    off = box.copy()
-    off[:2] += rng.uniform(-0.2, 0.2, 2)
-    both = move_to_points(np.stack([box, off]), points, 1.0)
-    np.testing.assert_allclose(both, [box, box], atol=0.02)
-    half = move_to_points(off[None], points, 0.5)[0]
-    np.testing.assert_allclose(half, (off + box) / 2, atol=0.02)
-    np.testing.assert_array_equal(move_to_points(off[None], points, 0.0)[0], off)
-    np.testing.assert_array_equal(move_to_points(off[None], points[:0], 1.0)[0], off)
-    cars = move_cars_to_points(np.stack([off, off]), np.array([CAR, PEDESTRIAN]), points, 1.0)
-    np.testing.assert_array_equal(cars, [move_to_points(off[None], points, 1.0)[0], off])
+    points = make_face_points(box, rng)
+    shifted = box.copy()
+    shifted[:2] += rng.uniform(-0.2, 0.2, 2)
+    corrected = move_to_points(np.stack([box, shifted]), points, 1.0)
+    np.testing.assert_allclose(corrected, [box, box], atol=0.02)
+    half_corrected = move_to_points(shifted[None], points, 0.5)[0]
+    np.testing.assert_allclose(half_corrected, (shifted + box) / 2, atol=0.02)
+    np.testing.assert_array_equal(move_to_points(shifted[None], points, 0.0)[0], shifted)
+    np.testing.assert_array_equal(move_to_points(shifted[None], points[:0], 1.0)[0], shifted)
+    cars = move_cars_to_points(np.stack([shifted, shifted]), np.array([CAR, PEDESTRIAN]), points, 1.0)
+    np.testing.assert_array_equal(cars, [move_to_points(shifted[None], points, 1.0)[0], shifted])
     # Never farther than the margin, however far the points are.
-    moved = move_to_points(off[None], points + [0.3, 0, 0], 1.0)
-    assert np.hypot(*(moved - off)[0, :2]) <= 2 * MARGIN_M
+    moved = move_to_points(shifted[None], points + [0.3, 0, 0], 1.0)
+    assert np.hypot(*(moved - shifted)[0, :2]) <= 2 * MARGIN_M
 
 
 def test_move_to_ground_skips_unknown_heights():
-    boxes = random_boxes(np.random.default_rng(0), 20)
+    boxes = make_random_boxes(np.random.default_rng(0), 20)
     floors = np.where(np.arange(20) % 4, boxes[:, 2] - 1, np.nan)
-    on = move_to_ground(boxes, floors, 1.0)
-    known = np.isfinite(floors)
-    np.testing.assert_allclose((on[:, 2] - on[:, 5] / 2)[known], floors[known])
-    np.testing.assert_array_equal(on[~known], boxes[~known])
+    moved = move_to_ground(boxes, floors, 1.0)
+    is_known = np.isfinite(floors)
+    np.testing.assert_allclose((moved[:, 2] - moved[:, 5] / 2)[is_known], floors[is_known])
+    np.testing.assert_array_equal(moved[~is_known], boxes[~is_known])
     np.testing.assert_array_equal(move_to_ground(boxes, floors, 0.0), boxes)
 
 
 @given(SEEDS)
 def test_move_towards_interpolates_and_keeps_heading(seed):
     rng = np.random.default_rng(seed)
-    boxes, others = random_boxes(rng, 20), random_boxes(rng, 20)
-    silent = rng.random(20) < 0.3
-    others[silent] = np.nan
-    there, half, none = (move_towards(boxes, others, share) for share in (1.0, 0.5, 0.0))
-    np.testing.assert_allclose(none[:, :6], boxes[:, :6])
-    np.testing.assert_allclose(wrap_angle(none[:, 6] - boxes[:, 6]), 0, atol=1e-9)
-    np.testing.assert_array_equal(half[silent], none[silent])
-    np.testing.assert_allclose(there[~silent, :6], others[~silent, :6])
-    np.testing.assert_allclose(half[:, :6], (none + there)[:, :6] / 2)
+    boxes, others = make_random_boxes(rng, 20), make_random_boxes(rng, 20)
+    is_missing = rng.random(20) < 0.3
+    others[is_missing] = np.nan
+    moved, half_moved, unmoved = (move_towards(boxes, others, weight) for weight in (1.0, 0.5, 0.0))
+    np.testing.assert_allclose(unmoved[:, :6], boxes[:, :6])
+    np.testing.assert_allclose(wrap_angle(unmoved[:, 6] - boxes[:, 6]), 0, atol=1e-9)
+    np.testing.assert_array_equal(half_moved[is_missing], unmoved[is_missing])
+    np.testing.assert_allclose(moved[~is_missing, :6], others[~is_missing, :6])
+    np.testing.assert_allclose(half_moved[:, :6], (unmoved + moved)[:, :6] / 2)
     # Headings are interpolated modulo 180 degrees, so they change by at most 90 degrees.
-    np.testing.assert_allclose(np.sin(there - others)[~silent, 6], 0, atol=1e-9)
-    turned, halfway = (wrap_angle(moved[:, 6] - none[:, 6]) for moved in (there, half))
-    assert (np.abs(turned) <= np.pi / 2 + 1e-9).all() and (np.abs(half[:, 6]) <= np.pi).all()
-    np.testing.assert_allclose(halfway, turned / 2, atol=1e-9)
+    np.testing.assert_allclose(np.sin(moved - others)[~is_missing, 6], 0, atol=1e-9)
+    yaw_change, half_yaw_change = (wrap_angle(moved[:, 6] - unmoved[:, 6]) for moved in (moved, half_moved))
+    assert (np.abs(yaw_change) <= np.pi / 2 + 1e-9).all() and (np.abs(half_moved[:, 6]) <= np.pi).all()
+    np.testing.assert_allclose(half_yaw_change, yaw_change / 2, atol=1e-9)
 
 
 @given(SEEDS)
@@ -147,17 +157,17 @@ def test_probability_increases_with_evidence(seed):
     class_ids = rng.choice([CLASSES.index(name) for name in load_shipped_models()], 50)
     evidence = {source: to_log_odds(rng.uniform(0, 1, 50)) for source in KNOTS}
     models = load_shipped_models()
-    before = compute_probabilities(models, class_ids, evidence)
-    assert ((before >= 0) & (before <= 1)).all() and before.dtype == np.float32
+    probabilities = compute_probabilities(models, class_ids, evidence)
+    assert ((probabilities >= 0) & (probabilities <= 1)).all() and probabilities.dtype == np.float32
     for source in KNOTS:
-        more = {**evidence, source: evidence[source] + rng.uniform(0, 3, 50)}
-        assert (compute_probabilities(models, class_ids, more) >= before - 1e-6).all()
-        silent = {**evidence, source: np.full(50, np.nan)}
-        assert np.isfinite(compute_probabilities(load_shipped_models(), class_ids, silent)).all()
-    unknown = np.full(50, CLASSES.index("Tram"))
-    assert not compute_probabilities(load_shipped_models(), unknown, evidence).any()
-    least = to_log_odds(MIN_PROBABILITY)
-    np.testing.assert_allclose(to_log_odds([0, 0.5, 1]), [least, 0, -least], atol=1e-9)
+        stronger_evidence = {**evidence, source: evidence[source] + rng.uniform(0, 3, 50)}
+        assert (compute_probabilities(models, class_ids, stronger_evidence) >= probabilities - 1e-6).all()
+        missing_evidence = {**evidence, source: np.full(50, np.nan)}
+        assert np.isfinite(compute_probabilities(load_shipped_models(), class_ids, missing_evidence)).all()
+    unknown_class_ids = np.full(50, CLASSES.index("Tram"))
+    assert not compute_probabilities(load_shipped_models(), unknown_class_ids, evidence).any()
+    min_log_odds = to_log_odds(MIN_PROBABILITY)
+    np.testing.assert_allclose(to_log_odds([0, 0.5, 1]), [min_log_odds, 0, -min_log_odds], atol=1e-9)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -180,11 +190,11 @@ def test_max_probability_holds_for_any_evidence_and_curve(seed):
     }
     ids, network = rng.integers(0, 3, 6), rng.normal(0, 3, 6)
     bound = compute_max_probabilities(models, ids, {"network": network}, "classifier")
-    answers = [
+    probabilities = [
         compute_probabilities(models, ids, {"network": network, "classifier": np.full(6, odds)})
         for odds in (np.nan, -np.inf, np.inf, *np.linspace(-4, 4, 33))
     ]
-    np.testing.assert_array_equal(bound, np.max(answers, axis=0))
+    np.testing.assert_array_equal(bound, np.max(probabilities, axis=0))
 
 
 def test_remove_duplicates_by_class():
@@ -201,11 +211,11 @@ def test_remove_duplicates_by_class():
         ]
     )
     ids = np.array([PEDESTRIAN] * 2 + [CAR] * 3 + [CLASSES.index("Cyclist"), CAR, PEDESTRIAN])
-    found = Detections.of(boxes, ids, [0.5, 0.8, 0.9, 0.7, 0.95, 0.4, 0.3, 0.2])
-    (car, person), (other, beside) = boxes[[4, 1]], boxes[[6, 7]]  # each pair overlaps by 4 %
-    assert min(bev_iou(car[None], other[None]), bev_iou(person[None], beside[None])) > 0.03
-    assert remove_duplicates(found, FusedParams()).tolist() == [4, 1, 3, 5, 7]
-    assert len(remove_duplicates(found[:0], FusedParams())) == 0
+    detections = Detections.of(boxes, ids, [0.5, 0.8, 0.9, 0.7, 0.95, 0.4, 0.3, 0.2])
+    (car, person), (second_car, second_person) = boxes[[4, 1]], boxes[[6, 7]]  # each pair overlaps by 4 %
+    assert min(bev_iou(car[None], second_car[None]), bev_iou(person[None], second_person[None])) > 0.03
+    assert remove_duplicates(detections, FusedParams()).tolist() == [4, 1, 3, 5, 7]
+    assert len(remove_duplicates(detections[:0], FusedParams())) == 0
 
 
 @pytest.fixture(scope="module")
@@ -218,19 +228,19 @@ def detector():
 
 def test_fused_fulfills_the_detector_contract(detector):
     scan = frame()
-    found = detector(scan)
-    assert len(found.detections) > 3 and tuple(found.timings) == STEPS
-    assert (np.diff(found.detections.scores) <= 0).all()
-    assert same(detector(scan), found)  # no state is left in the detector
-    said = found.detections.sources
-    assert set(said) == set(KNOTS) and all(len(x) == len(found.detections) for x in said.values())
-    cars = found.detections.class_ids == CAR
-    assert np.isnan(said["silhouette"][cars]).all() and np.isfinite(said["network"]).all()
-    middle = float(np.median(found.detections.scores))
-    strict = detector.with_min_score(middle)
-    assert set(strict.min_scores.values()) == {middle}
-    assert same(strict(scan), found.detections[found.detections.scores >= middle])
-    assert same(detector(scan), found)
+    result = detector(scan)
+    assert len(result.detections) > 3 and tuple(result.timings) == STEPS
+    assert (np.diff(result.detections.scores) <= 0).all()
+    assert same(detector(scan), result)  # no state is left in the detector
+    sources = result.detections.sources
+    assert set(sources) == set(KNOTS) and all(len(x) == len(result.detections) for x in sources.values())
+    is_car = result.detections.class_ids == CAR
+    assert np.isnan(sources["silhouette"][is_car]).all() and np.isfinite(sources["network"]).all()
+    median_score = float(np.median(result.detections.scores))
+    strict_detector = detector.with_min_score(median_score)
+    assert set(strict_detector.min_scores.values()) == {median_score}
+    assert same(strict_detector(scan), result.detections[result.detections.scores >= median_score])
+    assert same(detector(scan), result)
     nothing = detector.with_min_score(1.0)(scan)
     assert len(nothing.detections) == 0 and set(nothing.best) == set(detector.classes)
     empty = detector(PointCloud(np.zeros((0, 3), np.float32), np.zeros(0, np.float32)))
@@ -241,76 +251,90 @@ def test_fused_fulfills_the_detector_contract(detector):
 
 def test_sensor_height_and_given_columns_change_nothing(detector):
     scan = frame()
-    found = detector(scan).detections
-    high = replace(scan, xyz=scan.xyz - np.array([0, 0, 0.5], np.float32))
-    above = detector.with_sensor_height(1.73 + 0.5)(high).detections
-    above = replace(above, boxes=above.boxes + np.array([0, 0, 0.5, 0, 0, 0, 0], np.float32))
+    detections = detector(scan).detections
+    higher_scan = replace(scan, xyz=scan.xyz - np.array([0, 0, 0.5], np.float32))
+    higher_detections = detector.with_sensor_height(1.73 + 0.5)(higher_scan).detections
+    higher_detections = replace(
+        higher_detections, boxes=higher_detections.boxes + np.array([0, 0, 0.5, 0, 0, 0, 0], np.float32)
+    )
     # Except boxes that count as the ego vehicle of one of the sensors.
-    above, below = drop_ego_vehicle(above, 1.73), drop_ego_vehicle(found, 1.73 + 0.5)
-    assert len(below) > 90
-    np.testing.assert_allclose(above.boxes, below.boxes, atol=2e-3)
-    np.testing.assert_allclose(above.scores, below.scores, atol=2e-3)
+    higher_detections, lower_detections = (
+        drop_ego_vehicle(higher_detections, 1.73),
+        drop_ego_vehicle(detections, 1.73 + 0.5),
+    )
+    assert len(lower_detections) > 90
+    np.testing.assert_allclose(higher_detections.boxes, lower_detections.boxes, atol=2e-3)
+    np.testing.assert_allclose(higher_detections.scores, lower_detections.scores, atol=2e-3)
     # Points outside the range do not need a ground label.
     config = detector.proposer.config
     view = NormalizedView.of(scan, low=config.low, high=config.high)
     ground = np.zeros(len(scan), bool)
     ground[view.indices] = segment_view_ground(view.frame, detector.params.ground)
-    assert same(detector(scan, ground=ground), found)
-    assert same(detector(scan, ground=ground | ~np.isin(np.arange(len(scan)), view.indices)), found)
+    assert same(detector(scan, ground=ground), detections)
+    assert same(detector(scan, ground=ground | ~np.isin(np.arange(len(scan)), view.indices)), detections)
 
 
 @pytest.mark.parametrize("use_intensity", [True, False])
 @pytest.mark.parametrize("height", [1.73, 2.5])
 def test_ground_of_experts_in_range_gives_equal_detections(detector, height, use_intensity):
     """The ground_segmentation node segments only the range of the detector, with intensity."""
-    own = detector.with_params(with_values(detector.params, {"fused.use_intensity": use_intensity})).with_sensor_height(
-        height
-    )
-    scan, config = frame(), own.proposer.config
+    detector_copy = detector.with_params(
+        with_values(detector.params, {"fused.use_intensity": use_intensity})
+    ).with_sensor_height(height)
+    scan, config = frame(), detector_copy.proposer.config
     scan = replace(scan, xyz=scan.xyz - np.array([0, 0, height - 1.73], np.float32))
-    view = NormalizedView.of(scan, own.params.ground.sensor_pose, config.low, config.high)
+    view = NormalizedView.of(scan, detector_copy.params.ground.sensor_pose, config.low, config.high)
     ground = np.zeros(len(scan), bool)
-    ground[view.indices] = segment_view_ground(view.frame, own.params.ground)
-    found = own(scan)
-    assert len(found.detections) > 3 and same(own(scan, ground=ground), found)
+    ground[view.indices] = segment_view_ground(view.frame, detector_copy.params.ground)
+    result = detector_copy(scan)
+    assert len(result.detections) > 3 and same(detector_copy(scan, ground=ground), result)
 
 
 def test_ignored_intensity_equals_missing_intensity(detector):
     """This includes the ground segmentation, which removes low dark points as reflections."""
-    scan, other = frame(), copy.copy(detector)
-    other.params = with_values(detector.params, {"fused.use_intensity": False})
-    pit = np.random.default_rng(0).uniform([4, -4, -2.81], [9, 4, -2.79], (3000, 3))
+    scan, blind_detector = frame(), copy.copy(detector)
+    blind_detector.params = with_values(detector.params, {"fused.use_intensity": False})
+    pit_points = np.random.default_rng(0).uniform([4, -4, -2.81], [9, 4, -2.79], (3000, 3))
     scan = PointCloud(
-        np.concatenate([scan.xyz, pit.astype(np.float32)]),
+        np.concatenate([scan.xyz, pit_points.astype(np.float32)]),
         np.concatenate([scan.intensity, np.full(3000, 0.5, np.float32)]),
     )
-    without = replace(scan, intensity=None)
-    assert "no intensity" in detector(without).problem and other(without).problem is None
-    assert same(other(scan), other(without)) and other(scan).problem is None
-    surfaces = [one.propose(scan).surface.heights for one in (other, detector)]
+    scan_without_intensity = replace(scan, intensity=None)
+    assert (
+        "no intensity" in detector(scan_without_intensity).problem
+        and blind_detector(scan_without_intensity).problem is None
+    )
+    assert same(blind_detector(scan), blind_detector(scan_without_intensity)) and blind_detector(scan).problem is None
+    surfaces = [each.propose(scan).surface.heights for each in (blind_detector, detector)]
     np.testing.assert_array_equal(*surfaces)
 
 
 def test_max_proposals_keeps_the_best_boxes(detector):
-    whole, other = copy.copy(detector), copy.copy(detector)
-    own = with_values(detector.params, {"fused.classifier_box": 0.0})
-    whole.params, other.params = own, with_values(own, {"fused.max_proposals": 9})
-    every = whole.propose(frame()).detections
-    few = other.propose(frame()).detections  # without the ego vehicle
-    assert len(every) > 100 and 0 < len(few) <= 9 and same(few, every[: len(few)])
+    unlimited, limited = copy.copy(detector), copy.copy(detector)
+    params = with_values(detector.params, {"fused.classifier_box": 0.0})
+    unlimited.params, limited.params = params, with_values(params, {"fused.max_proposals": 9})
+    all_proposals = unlimited.propose(frame()).detections
+    best_proposals = limited.propose(frame()).detections  # without the ego vehicle
+    assert (
+        len(all_proposals) > 100
+        and 0 < len(best_proposals) <= 9
+        and same(best_proposals, all_proposals[: len(best_proposals)])
+    )
 
 
 def test_classifier_box_interpolates_between_networks(detector):
-    def looked(share: float) -> tuple[np.ndarray, np.ndarray]:
-        other = copy.copy(detector)
-        other.params = with_values(detector.params, {"fused.classifier_box": share})
-        proposals = other.propose(frame())
+    def propose(weight: float) -> tuple[np.ndarray, np.ndarray]:
+        detector_copy = copy.copy(detector)
+        detector_copy.params = with_values(detector.params, {"fused.classifier_box": weight})
+        proposals = detector_copy.propose(frame())
         return proposals.detections.boxes, np.isfinite(proposals.evidence["classifier"])
 
-    (own, asked), (half, _), (judged, _) = (looked(share) for share in (0.0, 0.5, 1.0))
-    assert asked.any() and not asked.all()
-    np.testing.assert_array_equal((own != judged).any(axis=1), asked)
-    np.testing.assert_allclose(half[:, :6], (own + judged)[:, :6] / 2, atol=1e-4)
+    (proposer_boxes, is_classified), (half_boxes, _), (classifier_boxes, _) = (
+        propose(weight) for weight in (0.0, 0.5, 1.0)
+    )
+    assert is_classified.any() and not is_classified.all()
+    np.testing.assert_array_equal((proposer_boxes != classifier_boxes).any(axis=1), is_classified)
+    np.testing.assert_allclose(half_boxes[:, :6], (proposer_boxes + classifier_boxes)[:, :6] / 2, atol=1e-4)
 
 
 def test_hilly_ground_changes_only_the_height_of_boxes():
@@ -322,18 +346,18 @@ def test_hilly_ground_changes_only_the_height_of_boxes():
         .load()
     )
 
-    def hills(xy: np.ndarray) -> np.ndarray:
+    def compute_height(xy: np.ndarray) -> np.ndarray:
         return 0.04 * xy[:, 0] + 0.5 * np.sin(xy[:, 1] / 12)
 
-    xyz = scan.xyz + np.outer(hills(scan.xyz), [0, 0, 1]).astype(np.float32)
-    plain, hilly = detector(scan).detections, detector(replace(scan, xyz=xyz)).detections
-    plain = plain[plain.scores > 0.8]
-    distances = centre_distances(plain.boxes, hilly.boxes)
-    found = distances.min(axis=1) < 0.2
-    assert found.sum() > 3 and found.mean() > 0.8
-    rise = (hilly.boxes[distances.argmin(axis=1), 2] - plain.boxes[:, 2])[found]
-    np.testing.assert_allclose(rise, hills(plain.boxes)[found], atol=0.1)
-    assert np.ptp(rise) > 0.5
+    xyz = scan.xyz + np.outer(compute_height(scan.xyz), [0, 0, 1]).astype(np.float32)
+    detections, hilly_detections = detector(scan).detections, detector(replace(scan, xyz=xyz)).detections
+    detections = detections[detections.scores > 0.8]
+    distances = centre_distances(detections.boxes, hilly_detections.boxes)
+    is_matched = distances.min(axis=1) < 0.2
+    assert is_matched.sum() > 3 and is_matched.mean() > 0.8
+    height_change = (hilly_detections.boxes[distances.argmin(axis=1), 2] - detections.boxes[:, 2])[is_matched]
+    np.testing.assert_allclose(height_change, compute_height(detections.boxes)[is_matched], atol=0.1)
+    assert np.ptp(height_change) > 0.5
 
 
 @pytest.mark.parametrize("height, stays", [(0.4, True), (1.0, True), (1.73, False), (6.0, True)])
@@ -345,10 +369,10 @@ def test_nearby_car_that_is_not_ego_vehicle_is_kept(detector, monkeypatch, heigh
 
 
 def test_cpu_fallback_of_one_network_is_reported(detector):
-    other = copy.copy(detector)
-    other.classifier = copy.copy(detector.classifier)
-    other.classifier.placement = Placement(CPU, "cuda is out of memory")
-    assert other(frame()).problem == "cuda is out of memory" and detector(frame()).problem is None
+    fallback_detector = copy.copy(detector)
+    fallback_detector.classifier = copy.copy(detector.classifier)
+    fallback_detector.classifier.placement = Placement(CPU, "cuda is out of memory")
+    assert fallback_detector(frame()).problem == "cuda is out of memory" and detector(frame()).problem is None
 
 
 def test_without_cpu_fallback_the_error_is_raised(detector, monkeypatch):
@@ -358,34 +382,34 @@ def test_without_cpu_fallback_the_error_is_raised(detector, monkeypatch):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(classifier, "predict", predict)
-    other = copy.copy(detector)
-    other.classifier = copy.copy(detector.classifier)
-    other.classifier.placement = Placement("meta")
-    other.params = with_values(detector.params, {"fused.cpu_fallback": False})
+    broken_detector = copy.copy(detector)
+    broken_detector.classifier = copy.copy(detector.classifier)
+    broken_detector.classifier.placement = Placement("meta")
+    broken_detector.params = with_values(detector.params, {"fused.cpu_fallback": False})
     with pytest.raises(InputError, match="meta is out of memory"):
-        other(frame())
+        broken_detector(frame())
 
 
 def test_parameters_can_change_between_clouds(detector):
-    other = copy.copy(detector)
-    other.params = with_values(detector.params, {"fused.proposals": 0.6})
-    assert len(other(frame()).detections) < len(detector(frame()).detections)
+    strict_detector = copy.copy(detector)
+    strict_detector.params = with_values(detector.params, {"fused.proposals": 0.6})
+    assert len(strict_detector(frame()).detections) < len(detector(frame()).detections)
     assert same(detector(frame()), detector(frame()))
 
 
 def test_clouds_without_usable_intensity_have_their_own_curves():
     detector = load_fused_detector("", "cpu", EAGER)
-    dark = copy.copy(detector)
-    dark.models = detector.models_without_intensity
-    assert dark.models != detector.models
+    other_curves = copy.copy(detector)
+    other_curves.models = detector.models_without_intensity
+    assert other_curves.models != detector.models
     scan = frame()
-    without = replace(scan, intensity=None)
-    any_score = detector.with_min_score(0.0), dark.with_min_score(0.0)
-    assert same(*(each(without) for each in any_score)) and not same(*(each(scan) for each in any_score))
-    assert same(detector(replace(scan, intensity=np.full_like(scan.intensity, 0.3))), detector(without))
-    off = detector.with_params(with_values(detector.params, {"fused.use_intensity": False}))
-    assert same(off(scan), detector(without))
-    low = detector.with_min_score(0.01)
-    assert len(low(without).detections) >= len(detector(without).detections)
-    one_set = FusedDetector(detector.proposer, detector.classifier, detector.params, detector.models)
-    assert one_set.models_without_intensity is one_set.models
+    scan_without_intensity = replace(scan, intensity=None)
+    detectors = detector.with_min_score(0.0), other_curves.with_min_score(0.0)
+    assert same(*(one(scan_without_intensity) for one in detectors)) and not same(*(one(scan) for one in detectors))
+    assert same(detector(replace(scan, intensity=np.full_like(scan.intensity, 0.3))), detector(scan_without_intensity))
+    detector_without_intensity = detector.with_params(with_values(detector.params, {"fused.use_intensity": False}))
+    assert same(detector_without_intensity(scan), detector(scan_without_intensity))
+    eager_detector = detector.with_min_score(0.01)
+    assert len(eager_detector(scan_without_intensity).detections) >= len(detector(scan_without_intensity).detections)
+    single_model_detector = FusedDetector(detector.proposer, detector.classifier, detector.params, detector.models)
+    assert single_model_detector.models_without_intensity is single_model_detector.models

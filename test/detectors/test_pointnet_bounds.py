@@ -19,19 +19,19 @@ def test_clusters_of_all_sizes_and_counts_work():
     detector = random_detector(with_values(eager(), {"pointnet.min_points": 1}))
     network, batches = detector.classifier.network, []
     network.compiled = None
-    network.network.register_forward_hook(lambda net, given, _: batches.append(len(given[0])))
-    one = PointCloud(np.float32([[9, 0, -1]]), np.ones(1, np.float32))
-    assert len(detector(one, cluster_ids=np.ones(1, int)).detections) == 1
+    network.network.register_forward_hook(lambda net, arguments, _: batches.append(len(arguments[0])))
+    single_point = PointCloud(np.float32([[9, 0, -1]]), np.ones(1, np.float32))
+    assert len(detector(single_point, cluster_ids=np.ones(1, int)).detections) == 1
     xyz = rng.uniform([5, -3, -1.7], [9, 3, 2], (50_000, 3)).astype(np.float32)
-    big = PointCloud(xyz, rng.uniform(0, 1, len(xyz)).astype(np.float32))
-    assert len(detector(big, cluster_ids=np.ones(len(xyz), int)).detections) == 1
-    spots = rng.uniform(-80, 80, (5000, 1, 3)) * [1, 1, 0.01]
-    xyz = (spots + rng.normal(0, 0.2, (5000, 6, 3))).reshape(-1, 3).astype(np.float32)
+    large_cloud = PointCloud(xyz, rng.uniform(0, 1, len(xyz)).astype(np.float32))
+    assert len(detector(large_cloud, cluster_ids=np.ones(len(xyz), int)).detections) == 1
+    centres = rng.uniform(-80, 80, (5000, 1, 3)) * [1, 1, 0.01]
+    xyz = (centres + rng.normal(0, 0.2, (5000, 6, 3))).reshape(-1, 3).astype(np.float32)
     batches.clear()
-    found = detector(PointCloud(xyz, np.zeros(len(xyz), np.float32)), cluster_ids=np.repeat(np.arange(5000), 6) + 1)
+    result = detector(PointCloud(xyz, np.zeros(len(xyz), np.float32)), cluster_ids=np.repeat(np.arange(5000), 6) + 1)
     assert sum(batches) == 4000 and max(batches) <= CHUNK
-    assert len(found.detections) == detector.params.pointnet.nms.max_boxes
-    assert "farthest 1000 of 5000 clusters are ignored" in found.problem
+    assert len(result.detections) == detector.params.pointnet.nms.max_boxes
+    assert "farthest 1000 of 5000 clusters are ignored" in result.problem
 
 
 def test_excess_clusters_are_dropped_by_distance_and_counted():
@@ -42,28 +42,28 @@ def test_excess_clusters_are_dropped_by_distance_and_counted():
     frame = PointCloud(xyz, np.full(1800, 0.5, np.float32))
     ids, ground = np.repeat(np.arange(1, 301), 6), np.zeros(1800, bool)
 
-    def detected(params, chosen=None):
-        wanted = ids if chosen is None else np.where(chosen, ids, 0)
+    def detect(params, mask=None):
+        cluster_ids = ids if mask is None else np.where(mask, ids, 0)
         return random_detector(with_values(params, {"pointnet.use_intensity": False}))(
-            frame, ground=ground, cluster_ids=wanted
+            frame, ground=ground, cluster_ids=cluster_ids
         )
 
-    few = with_values(eager(), {"pointnet.max_clusters": 40})
-    capped, everything = detected(few), detected(eager())
-    assert "farthest 260 of 300 clusters are ignored" in capped.problem
-    assert "left out" not in (everything.problem or "")
+    limited_params = with_values(eager(), {"pointnet.max_clusters": 40})
+    limited_result, full_result = detect(limited_params), detect(eager())
+    assert "farthest 260 of 300 clusters are ignored" in limited_result.problem
+    assert "left out" not in (full_result.problem or "")
     means = np.add.reduceat(xyz, np.arange(0, 1800, 6)) / 6
     nearest = np.argsort(np.hypot(means[:, 0], means[:, 1]))[:40] + 1
-    expected = detected(eager(), np.isin(ids, nearest))
-    np.testing.assert_array_equal(capped.detections.boxes, expected.detections.boxes)
-    assert 0 < len(capped.detections) < len(everything.detections)
+    expected = detect(eager(), np.isin(ids, nearest))
+    np.testing.assert_array_equal(limited_result.detections.boxes, expected.detections.boxes)
+    assert 0 < len(limited_result.detections) < len(full_result.detections)
 
 
 def test_ground_height_does_not_depend_on_distant_clusters():
     rng = np.random.default_rng(1)
     ground = rng.uniform([-40, -40, -1.8], [40, 40, -1.6], (5000, 3)).astype(np.float32)
-    places = rng.uniform(-30, 30, (50, 2))
-    near = find_ground_heights(ground, places)
-    far = np.array([[9e4, -9e4], [-9e4, 9e4]])
-    both = find_ground_heights(ground, np.concatenate([places, far]))
-    np.testing.assert_array_equal(both[:50], near)
+    positions = rng.uniform(-30, 30, (50, 2))
+    heights = find_ground_heights(ground, positions)
+    distant_positions = np.array([[9e4, -9e4], [-9e4, 9e4]])
+    all_heights = find_ground_heights(ground, np.concatenate([positions, distant_positions]))
+    np.testing.assert_array_equal(all_heights[:50], heights)

@@ -35,33 +35,35 @@ def proposals():
 
 
 def test_clusters_are_points_in_each_box(frame, proposals):
-    made = crop_boxes(proposals.boxes, frame, 0.2)
-    assert len(made) == len(proposals) and made.sizes[3] < 5 < made.sizes[:3].min()
+    clusters = crop_boxes(proposals.boxes, frame, 0.2)
+    assert len(clusters) == len(proposals) and clusters.sizes[3] < 5 < clusters.sizes[:3].min()
     for i, box in enumerate(proposals.boxes):
-        part, inside = made.points[made.first[i] : made.first[i + 1]], points_in_box(frame.xyz, box, 0.2)
-        np.testing.assert_array_equal(part[:, :3], frame.xyz[inside])
-        np.testing.assert_array_equal(part[:, 3], frame.intensity[inside])
-    dark = crop_boxes(proposals.boxes, replace(frame, intensity=None), 0.2)
-    assert not dark.points[:, 3].any() and (dark.first == made.first).all()
+        points, in_box = clusters.points[clusters.first[i] : clusters.first[i + 1]], points_in_box(frame.xyz, box, 0.2)
+        np.testing.assert_array_equal(points[:, :3], frame.xyz[in_box])
+        np.testing.assert_array_equal(points[:, 3], frame.intensity[in_box])
+    clusters_without_intensity = crop_boxes(proposals.boxes, replace(frame, intensity=None), 0.2)
+    assert (
+        not clusters_without_intensity.points[:, 3].any() and (clusters_without_intensity.first == clusters.first).all()
+    )
     assert len(crop_boxes(proposals.boxes[:0], frame, 0.2)) == 0
 
 
 def test_class_of_a_proposal_does_not_depend_on_others(frame, proposals):
     classifier, ground = random_detector().classifier, np.zeros((0, 3), np.float32)
-    every = np.ones(len(proposals), bool)
-    probabilities, boxes = classifier.classify(proposals, frame, ground, every)
+    mask = np.ones(len(proposals), bool)
+    probabilities, boxes = classifier.classify(proposals, frame, ground, mask)
     predictions = predict(classifier.network, crop_boxes(proposals.boxes[:3], frame, BOX_MARGIN_M))
     columns = [classifier.classes.index(CLASSES[i]) for i in proposals.class_ids[:3]]
     np.testing.assert_allclose(probabilities[:3], predictions.probabilities[np.arange(3), columns], atol=1e-6)
-    again = classifier.classify(proposals[::-1], frame, ground, every)
-    np.testing.assert_allclose(again[0], probabilities[::-1], atol=1e-5)
-    np.testing.assert_allclose(again[1], boxes[::-1], atol=1e-4)
-    assert [len(a) for a in classifier.classify(proposals[:0], frame, ground, every[:0])] == [0, 0]
+    reversed_results = classifier.classify(proposals[::-1], frame, ground, mask)
+    np.testing.assert_allclose(reversed_results[0], probabilities[::-1], atol=1e-5)
+    np.testing.assert_allclose(reversed_results[1], boxes[::-1], atol=1e-4)
+    assert [len(a) for a in classifier.classify(proposals[:0], frame, ground, mask[:0])] == [0, 0]
 
 
 def test_classifier_skips_unknown_classes_and_empty_boxes(frame, proposals):
     proposals.class_ids[1] = VAN
-    selected = np.array([True, True, False, True])
-    for values in random_detector().classifier.classify(proposals, frame, frame.xyz[:0], selected):
-        judged = np.isfinite(values.reshape(4, -1)).all(axis=1)
-        assert judged.tolist() == [True, False, False, False]
+    mask = np.array([True, True, False, True])
+    for values in random_detector().classifier.classify(proposals, frame, frame.xyz[:0], mask):
+        is_classified = np.isfinite(values.reshape(4, -1)).all(axis=1)
+        assert is_classified.tolist() == [True, False, False, False]

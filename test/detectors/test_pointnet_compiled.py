@@ -28,19 +28,19 @@ SIZES = [1, 2, 3, 5, 11, 12, 13, 31, 32, 33, 100, 300, 7]
 TOLERANCE = 1e-4  # for values of about 1 to 20
 
 
-def compiled_network(network):
+def compile_network(network):
     return CompiledPointNet(network.config, to_arrays(network))
 
 
 def assert_equal(config, clusters, seed=0):
     network = lively(config, seed)
-    inputs = make_network_input(clusters, config.points, farthest=config.farthest)
+    inputs = make_network_input(clusters, config.points, farthest_count=config.farthest_count)
     with torch.inference_mode():
-        found, wanted = compiled_network(network)(inputs), run_network(network, inputs)
-    for ours, theirs in zip(found, wanted):
-        assert ours.shape == theirs.shape
-        np.testing.assert_allclose(ours, theirs, rtol=0, atol=TOLERANCE)
-    assert wanted.logits.std(dim=0).max() > 0.1  # clusters have different outputs
+        outputs, expected_outputs = compile_network(network)(inputs), run_network(network, inputs)
+    for actual, expected in zip(outputs, expected_outputs):
+        assert actual.shape == expected.shape
+        np.testing.assert_allclose(actual, expected, rtol=0, atol=TOLERANCE)
+    assert expected_outputs.logits.std(dim=0).max() > 0.1  # clusters have different outputs
 
 
 @pytest.mark.parametrize("spread", [0.05, 0.4, 3.0])
@@ -74,20 +74,20 @@ def test_other_widths_equal_torch(changes):
 
 
 def test_result_of_a_cluster_does_not_depend_on_the_batch(monkeypatch):
-    network = compiled_network(lively(small()))
+    network = compile_network(lively(small()))
     clusters = blobs(np.random.default_rng(2), SIZES * 3)
-    whole = predict(network, clusters)
-    chosen = np.array([4, 0, 30, 17])
-    part = predict(network, clusters.take(chosen))
-    np.testing.assert_array_equal(part.probabilities, whole.probabilities[chosen])
+    predictions = predict(network, clusters)
+    indices = np.array([4, 0, 30, 17])
+    subset_predictions = predict(network, clusters.take(indices))
+    np.testing.assert_array_equal(subset_predictions.probabilities, predictions.probabilities[indices])
     monkeypatch.setattr(compiled, "CHUNK", 2)
     set_thread_count(3)
-    again = predict(network, clusters)
-    np.testing.assert_array_equal(again.probabilities, whole.probabilities)
-    np.testing.assert_array_equal(again.boxes, whole.boxes)
+    threaded_predictions = predict(network, clusters)
+    np.testing.assert_array_equal(threaded_predictions.probabilities, predictions.probabilities)
+    np.testing.assert_array_equal(threaded_predictions.boxes, predictions.boxes)
     assert len(predict(network, clusters.take(np.zeros(0, int))).boxes) == 0
-    nothing = make_network_input(clusters.take(np.zeros(0, int)), 32)
-    assert all(len(x) == 0 for x in network(nothing))
+    empty_input = make_network_input(clusters.take(np.zeros(0, int)), 32)
+    assert all(len(x) == 0 for x in network(empty_input))
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_nan_weights_give_nan_logits(name):
     network = fuse_norms(lively(small()))
     network.get_parameter(name).view(-1)[0] = torch.nan
     inputs = make_network_input(blobs(np.random.default_rng(3), SIZES), 32)
-    assert np.isnan(compiled_network(network)(inputs).logits).all()
+    assert np.isnan(compile_network(network)(inputs).logits).all()
 
 
 @pytest.mark.parametrize("weights", ["fused", "pointnet"])
@@ -110,8 +110,8 @@ def test_torch_engine_compiles_nothing(weights):
 def test_compiled_classifier_equals_torch():
     classifier = random_detector().classifier
     clusters = blobs(np.random.default_rng(4), SIZES)
-    found = classifier.predict(clusters)
+    predictions = classifier.predict(clusters)
     classifier.network.compiled = None
-    wanted = classifier.predict(clusters)
-    np.testing.assert_allclose(found.probabilities, wanted.probabilities, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(found.boxes, wanted.boxes, rtol=0, atol=TOLERANCE)
+    expected = classifier.predict(clusters)
+    np.testing.assert_allclose(predictions.probabilities, expected.probabilities, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(predictions.boxes, expected.boxes, rtol=0, atol=TOLERANCE)

@@ -39,7 +39,7 @@ TOLERANCE = 1e-4  # for features and logits of about 1 to 30
 WIDE = dict(low=(-12.8, -14.08, -3.0), high=(12.8, 14.08, 1.0))  # 176 x 160 pillars
 
 
-def strong(config, seed=0):
+def make_strong_network(config, seed=0):
     """Return a network in which each point affects the outputs of the last layer."""
     network = lively(config, seed)
     for module in network.modules():
@@ -48,48 +48,52 @@ def strong(config, seed=0):
     return network
 
 
-def sparse_network(network):
+def make_sparse_network(network):
     return sparse.SparseNetwork(network.pillar_net.config, to_arrays(network))
 
 
-def inputs(config, points, drawn, seed=0, share=1.0):
-    """Return pillars of random points in a fraction of each axis, and a cluster map in which the fraction `drawn`
-    of these cells is filled."""
+def make_inputs(config, points, map_fraction, seed=0, range_fraction=1.0):
+    """Return pillars of random points, and a cluster map.
+
+    Args:
+        map_fraction: fraction of the cells that are filled in the map.
+        range_fraction: fraction of each axis that contains points and filled cells.
+    """
     rng = np.random.default_rng(seed)
     cloud = rng.uniform([*config.low, 0], [*config.high, 1], (points, 4))
-    cloud[:, :2] = config.low[:2] + share * (cloud[:, :2] - config.low[:2])
+    cloud[:, :2] = config.low[:2] + range_fraction * (cloud[:, :2] - config.low[:2])
     if config.cluster_ids:
         cloud = np.column_stack([cloud, rng.integers(0, 60, points)])
-    maps = (rng.random((1, 3, *config.grid)) < drawn).astype(np.uint8)
+    maps = (rng.random((1, 3, *config.grid)) < map_fraction).astype(np.uint8)
     for axis in 2, 3:
-        maps.swapaxes(2, axis)[:, :, int(share * maps.shape[axis]) :] = 0
+        maps.swapaxes(2, axis)[:, :, int(range_fraction * maps.shape[axis]) :] = 0
     return (make_pillars(cloud.astype(np.float32), config), maps if config.pseudo_map else None)
 
 
-def by_torch(network, pillars, maps):
+def by_torch(network, torch_pillars, maps):
     """Return features and logits (H * W, C) of all cells."""
-    pillars = Pillars(*map(torch.from_numpy, pillars[:3]), *pillars[3:])
-    features = network.features(pillars, None if maps is None else torch.from_numpy(maps))
+    torch_pillars = Pillars(*map(torch.from_numpy, torch_pillars[:3]), *torch_pillars[3:])
+    features = network.compute_features(torch_pillars, None if maps is None else torch.from_numpy(maps))
     return [x[0].flatten(1).T.numpy() for x in (features, network.head.scores(features))]
 
 
-def assert_equal(config, points, drawn, reach=None, seed=0, share=1.0):
-    network = strong(config, seed)
-    pillars, maps = inputs(config, points, drawn, seed, share)
+def assert_equal(config, points, map_fraction, reach=None, seed=0, range_fraction=1.0):
+    network = make_strong_network(config, seed)
+    pillars, maps = make_inputs(config, points, map_fraction, seed, range_fraction)
     with torch.inference_mode():
         expected = by_torch(network, pillars, maps)
-    cells, features, logits = sparse_network(network).evaluate(pillars, maps, reach)
+    cells, features, logits = make_sparse_network(network).evaluate(pillars, maps, reach)
     assert len(cells) == len(expected[0]) or reach is not None
-    values = features.values_at(cells)[:, : expected[0].shape[1]]
-    for found, wanted in (values, expected[0]), (logits, expected[1]):
-        np.testing.assert_allclose(found, wanted[cells], rtol=0, atol=TOLERANCE)
+    values = features.get_features(cells)[:, : expected[0].shape[1]]
+    for actual, required in (values, expected[0]), (logits, expected[1]):
+        np.testing.assert_allclose(actual, required[cells], rtol=0, atol=TOLERANCE)
     return expected[0]
 
 
 @pytest.mark.parametrize("version", ["v1", "v2", "v4"])
-@pytest.mark.parametrize(("points", "drawn"), [(0, 0.0), (1, 0.0), (5, 0.01), (20_000, 1.0)])
-def test_small_network_equals_torch(version, points, drawn):
-    assert_equal(tiny(version), points, drawn, seed=points)
+@pytest.mark.parametrize(("points", "map_fraction"), [(0, 0.0), (1, 0.0), (5, 0.01), (20_000, 1.0)])
+def test_small_network_equals_torch(version, points, map_fraction):
+    assert_equal(tiny(version), points, map_fraction, seed=points)
 
 
 @pytest.mark.parametrize(
@@ -123,26 +127,26 @@ def test_small_network_equals_torch(version, points, drawn):
 )
 def test_shipped_sizes_equal_torch_also_at_the_border(version, size, changes):
     config = make_config(version, size, **changes)
-    few = assert_equal(config, 12, 0.001, share=0.1)
-    none = assert_equal(config, 0, 0.0)
-    changed = np.abs(few - none).max(axis=1)
-    assert changed.max() > 0.05 and (size == "full" or changed.min() < 1e-6)
+    features = assert_equal(config, 12, 0.001, range_fraction=0.1)
+    empty_features = assert_equal(config, 0, 0.0)
+    max_change = np.abs(features - empty_features).max(axis=1)
+    assert max_change.max() > 0.05 and (size == "full" or max_change.min() < 1e-6)
 
 
 def test_head_is_evaluated_near_points_only():
     config = make_config("v4", "compact", **WIDE)
     assert_equal(config, 10, 0.0, reach=sparse.REACH)
-    pillars, maps = inputs(config, 10, 0.0)
-    network = sparse_network(strong(config))
+    pillars, maps = make_inputs(config, 10, 0.0)
+    network = make_sparse_network(make_strong_network(config))
     prediction = network(pillars, maps)
     occupied = np.zeros(config.grid, bool)
     occupied.ravel()[pillars.cells] = True
     rows, columns = np.nonzero(shrink(occupied, 2))
     height, width = config.head_grid
-    away = np.maximum(np.abs(np.arange(height)[:, None, None] - rows), np.abs(np.arange(width)[:, None] - columns)).min(
-        axis=2
-    )
-    cells = np.flatnonzero(away <= 6)
+    distance = np.maximum(
+        np.abs(np.arange(height)[:, None, None] - rows), np.abs(np.arange(width)[:, None] - columns)
+    ).min(axis=2)
+    cells = np.flatnonzero(distance <= 6)
     per_cell = config.anchors_per_cell
     np.testing.assert_array_equal(prediction.anchors, (cells[:, None] * per_cell + np.arange(per_cell)).ravel())
     assert prediction.logits.shape == (len(cells) * per_cell, 3)
@@ -150,28 +154,28 @@ def test_head_is_evaluated_near_points_only():
 
 def test_boxes_equal_torch_at_any_anchors():
     config = tiny("v4")
-    network, (pillars, maps) = strong(config), inputs(config, 30, 0.02)
-    wanted, found = TorchNetwork(network)(pillars, maps), sparse_network(network)(pillars, maps)
-    chosen = np.array([0, 5, 17, len(found.anchors) - 1])
-    for ours, theirs in zip(found.boxes_at(chosen), wanted.boxes_at(found.anchors[chosen])):
-        np.testing.assert_allclose(ours, theirs, rtol=0, atol=TOLERANCE)
+    network, (pillars, maps) = make_strong_network(config), make_inputs(config, 30, 0.02)
+    expected, actual = TorchNetwork(network)(pillars, maps), make_sparse_network(network)(pillars, maps)
+    rows = np.array([0, 5, 17, len(actual.anchors) - 1])
+    for actual_values, expected_values in zip(actual.compute_boxes(rows), expected.compute_boxes(actual.anchors[rows])):
+        np.testing.assert_allclose(actual_values, expected_values, rtol=0, atol=TOLERANCE)
 
 
 def test_threads_and_earlier_clouds_change_nothing(monkeypatch):
     monkeypatch.setattr(sparse, "MIN_PER_PART", 1000)
     config = make_config("v4", "compact", **WIDE)
-    network = sparse_network(strong(config))
-    first, second = inputs(config, 50, 0.001), inputs(config, 3000, 0.05, seed=1)
-    alone = network(*first)
+    network = make_sparse_network(make_strong_network(config))
+    sparse_inputs, dense_inputs = make_inputs(config, 50, 0.001), make_inputs(config, 3000, 0.05, seed=1)
+    expected = network(*sparse_inputs)
     set_thread_count(3)
-    kept = network(*second)
-    again = network(*first)
-    assert np.array_equal(alone.logits, again.logits)
-    assert np.array_equal(alone.anchors, again.anchors)
-    chosen = np.arange(9)
-    assert all(map(np.array_equal, alone.boxes_at(chosen), again.boxes_at(chosen)))
+    dense_result = network(*dense_inputs)
+    repeated = network(*sparse_inputs)
+    assert np.array_equal(expected.logits, repeated.logits)
+    assert np.array_equal(expected.anchors, repeated.anchors)
+    rows = np.arange(9)
+    assert all(map(np.array_equal, expected.compute_boxes(rows), repeated.compute_boxes(rows)))
     set_thread_count(1)
-    assert np.array_equal(kept.logits, network(*second).logits)
+    assert np.array_equal(dense_result.logits, network(*dense_inputs).logits)
 
 
 def test_an_error_in_one_part_is_raised(monkeypatch):
@@ -189,42 +193,42 @@ def test_nan_weights_are_reported(layer):
     config = tiny("v4")
     network = lively(config)
     network.get_parameter(layer).fill_(torch.nan)
-    detector = make_detector(sparse_network(network), Header(config))
+    detector = make_detector(make_sparse_network(network), Header(config))
     rng = np.random.default_rng(0)
     cloud = rng.uniform([2, -3, -1, 0], [6, 3, 0, 1], (200, 4)).astype(np.float32)
-    found = detector(cloud, ground=np.zeros(200, bool), cluster_ids=np.zeros(200, int))
-    assert len(found.detections) == 0 and found.problem
+    result = detector(cloud, ground=np.zeros(200, bool), cluster_ids=np.zeros(200, int))
+    assert len(result.detections) == 0 and result.problem
 
 
 @pytest.mark.parametrize(
-    "config, settings, words",
+    "config, settings, message",
     [
         (tiny("v0"), {}, "ground"),
         (tiny("v3"), {}, "ground"),
         (tiny("v1", fusion="concat"), {}, "neck"),
         (tiny("v1", neck="deconv"), {}, "neck"),
-        (tiny("v1", max_points=4, zero_row=True), {}, "rows of zeros"),
+        (tiny("v1", max_points=4, zero_row=True), {}, "padded with zeros"),
         (tiny("v4"), {"pointpillars.amp": "bf16"}, "16 bits"),
         (tiny("v4"), {}, "AVX2"),
     ],
 )
-def test_unsupported_networks_run_in_torch(config, settings, words, tmp_path, monkeypatch):
+def test_unsupported_networks_run_in_torch(config, settings, message, tmp_path, monkeypatch):
     path = tmp_path / "a.safetensors"
     save_checkpoint(path, lively(config), Header(config))
-    if words == "AVX2":
+    if message == "AVX2":
         monkeypatch.setattr(sparse, "LANES", 0)
     settings = {**settings, "pointpillars.warm_up": False}
     detector = open_detector(path, "cpu", settings=settings)
     assert isinstance(detector.proposer.network, TorchNetwork)
-    with pytest.raises(InputError, match=f"{words}.*; choose the engine auto or torch"):
+    with pytest.raises(InputError, match=f"{message}.*; set engine: auto or torch"):
         open_detector(path, "cpu", settings={**settings, "pointpillars.engine": "sparse"})
 
 
 @pytest.mark.parametrize("weights", ["fused", "pointpillars"])
 def test_parameter_selects_the_engine(weights):
-    quick = {f"{weights}.warm_up": False}
+    base_settings = {f"{weights}.warm_up": False}
     for engine, expected in ("auto", True), ("sparse", True), ("torch", False):
-        detector = open_detector(weights, "cpu", settings={**quick, f"{weights}.engine": engine})
+        detector = open_detector(weights, "cpu", settings={**base_settings, f"{weights}.engine": engine})
         assert isinstance(detector.proposer.network, sparse.SparseNetwork) == expected
     with pytest.raises(InputError, match="engine"):
         open_detector(
@@ -269,23 +273,23 @@ def test_detector_of_random_weights_equals_torch(version):
     detector = random_detector(version)
     detector.params = with_values(detector.params, {"pointpillars.nms.candidates": 5000})
     header = detector.proposer.header
-    other = make_detector(sparse_network(lively(header.config)), header, detector.params)
+    sparse_detector = make_detector(make_sparse_network(lively(header.config)), header, detector.params)
     rng = np.random.default_rng(3)
     cloud = rng.uniform([0, -5, -1.5, 0], [10, 5, 0.5, 1], (4000, 4)).astype(np.float32)
     columns = dict(ground=np.zeros(4000, bool), cluster_ids=rng.integers(0, 9, 4000))
-    found = detector(cloud, **columns)
-    assert len(found.detections) > 3
-    assert same(other(cloud, **columns), found, atol=TOLERANCE)
+    result = detector(cloud, **columns)
+    assert len(result.detections) > 3
+    assert same(sparse_detector(cloud, **columns), result, atol=TOLERANCE)
 
 
 def test_a_cloud_without_a_pillar_detects_nothing():
     detector = random_detector("v4")
     proposer, config = detector.proposer, detector.proposer.config
-    proposer.network = sparse_network(lively(config))
-    broken = NetworkInput(np.full((10, 4), np.nan, np.float32), np.zeros((3, *config.grid), np.uint8))
-    _, predictions = proposer._predict({False: broken})
-    found = proposer._decode(predictions, [0.5] * 3, NmsParams())
-    assert len(found.detections) == 0 and found.best == {} and found.problem is None
+    proposer.network = make_sparse_network(lively(config))
+    nan_input = NetworkInput(np.full((10, 4), np.nan, np.float32), np.zeros((3, *config.grid), np.uint8))
+    _, predictions = proposer._predict({False: nan_input})
+    result = proposer._decode(predictions, [0.5] * 3, NmsParams())
+    assert len(result.detections) == 0 and result.best == {} and result.problem is None
 
 
 KERNEL = """
@@ -329,6 +333,6 @@ def test_processor_without_vector_kernel_uses_torch(variable):
 def test_dilation_grows_along_both_axes():
     mask = np.zeros((9, 7), bool)
     mask[0, 6] = mask[5, 2] = True
-    wanted = np.zeros_like(mask)
-    wanted[:3, 4:] = wanted[3:8, :5] = True
-    np.testing.assert_array_equal(dilate(mask, 2), wanted)
+    expected = np.zeros_like(mask)
+    expected[:3, 4:] = expected[3:8, :5] = True
+    np.testing.assert_array_equal(dilate(mask, 2), expected)

@@ -61,47 +61,51 @@ def test_checkpoint_round_trip(saved, tmp_path):
     assert (tmp_path / "half").stat().st_size < path.stat().st_size
     for name, value in load_network(tmp_path / "half")[1].state_dict().items():
         torch.testing.assert_close(value, network.state_dict()[name], atol=1e-7, rtol=0 if value.ndim < 2 else 2**-10)
-    found = load_detector(path, "cpu", eager(engine="torch"))(frame())
+    result = load_detector(path, "cpu", eager(engine="torch"))(frame())
     expected = make_detector(TorchNetwork(network), header, eager())(frame())
-    assert len(found.detections) and same(found, expected)
+    assert len(result.detections) and same(result, expected)
 
 
 def test_error_for_another_config_shows_both_values(saved):
     path, _, _ = saved
     with pytest.raises(InputError, match=r"version is v4, expected v2"):
         load_network(path, tiny("v2"))
-    wanted = with_values(DetectorParams(), {"pointpillars.version": "v1"})
-    with pytest.raises(InputError, match=r"has the version v4, not v1"):
-        load_detector(path, "cpu", wanted)
-    with pytest.raises(InputError, match=r"has the size compact, not full"):
+    params = with_values(DetectorParams(), {"pointpillars.version": "v1"})
+    with pytest.raises(InputError, match=r"has version v4, not v1"):
+        load_detector(path, "cpu", params)
+    with pytest.raises(InputError, match=r"has size compact, not full"):
         load_detector(path, "cpu", with_values(DetectorParams(), {"pointpillars.size": "full"}))
 
 
 def test_matching_weights_of_another_network_are_copied(saved):
     path, header, network = saved
     state = network.state_dict()
-    same = make_network(header.config)
-    taken, count = copy_matching_weights(same, path, NetworkConfig)
-    assert taken == count == len(state)
-    assert all(torch.equal(value, state[name]) for name, value in same.state_dict().items())
+    same_network = make_network(header.config)
+    copied, count = copy_matching_weights(same_network, path, NetworkConfig)
+    assert copied == count == len(state)
+    assert all(torch.equal(value, state[name]) for name, value in same_network.state_dict().items())
     # without the map branch the first block has fewer inputs; it copies the matching ones
-    other = make_network(tiny("v1"))
-    taken, count = copy_matching_weights(other, path, NetworkConfig)
-    assert taken == count
-    first, old = (s["blocks.0.0.0.weight"] for s in (other.state_dict(), state))
-    assert first.shape[1] < old.shape[1] and torch.equal(first, old[:, : first.shape[1]])
+    smaller_network = make_network(tiny("v1"))
+    copied, count = copy_matching_weights(smaller_network, path, NetworkConfig)
+    assert copied == count
+    new_weight, stored_weight = (s["blocks.0.0.0.weight"] for s in (smaller_network.state_dict(), state))
+    assert new_weight.shape[1] < stored_weight.shape[1] and torch.equal(
+        new_weight, stored_weight[:, : new_weight.shape[1]]
+    )
     # a new input, such as the cluster id, comes last and starts at 0
-    numbered = make_network(tiny("v2"))
-    assert len(set(copy_matching_weights(numbered, path, NetworkConfig))) == 1
-    first, old = (s["pillar_net.linear.weight"] for s in (numbered.state_dict(), state))
-    assert torch.equal(first[:, :-1], old) and not first[:, -1].any()
+    network_with_ids = make_network(tiny("v2"))
+    assert len(set(copy_matching_weights(network_with_ids, path, NetworkConfig))) == 1
+    new_weight, stored_weight = (s["pillar_net.linear.weight"] for s in (network_with_ids.state_dict(), state))
+    assert torch.equal(new_weight[:, :-1], stored_weight) and not new_weight[:, -1].any()
     # a different neck starts with random weights
-    third = make_network(tiny("v0"))
-    before = {name: value.clone() for name, value in third.state_dict().items()}
-    taken, count = copy_matching_weights(third, path, NetworkConfig)
-    assert 0 < taken < count
+    different_network = make_network(tiny("v0"))
+    initial_state = {name: value.clone() for name, value in different_network.state_dict().items()}
+    copied, count = copy_matching_weights(different_network, path, NetworkConfig)
+    assert 0 < copied < count
     assert all(
-        torch.equal(value, before[name]) for name, value in third.state_dict().items() if name.startswith("neck")
+        torch.equal(value, initial_state[name])
+        for name, value in different_network.state_dict().items()
+        if name.startswith("neck")
     )
     with pytest.raises(InputError, match="no layer"):
         copy_matching_weights(torch.nn.Linear(2, 3), path, NetworkConfig)
@@ -112,44 +116,44 @@ def test_invalid_checkpoint_files_are_rejected(saved, tmp_path):
     content = path.read_bytes()
     length = struct.unpack("<Q", content[:8])[0]
     names = json.loads(content[8 : 8 + length])
-    other = json.loads(names["__metadata__"]["lidar_perception"])
+    header = json.loads(names["__metadata__"]["lidar_perception"])
     cases = {
-        "missing": (None, "no checkpoint"),
+        "missing": (None, "checkpoint not found"),
         "cut": (content[:-9], "is truncated"),
         "text": (b"hello", "is truncated"),
         "empty": (b"", "is truncated"),
     }
-    for name, change, words in (
+    for name, change, message in (
         ("foreign", None, "import-weights"),
-        ("later", dict(format=9), "format 9"),
-        ("unknown", dict(config={**other["config"], "colour": 1}), "'colour'"),
-        ("unfit", dict(config={**other["config"], "fpn_channels": 9}), "do not fit"),
-        ("odd", dict(config={**other["config"], "cell": "wide"}), "has an invalid network config"),
+        ("later", dict(format=9), "format version 9"),
+        ("unknown", dict(config={**header["config"], "colour": 1}), "'colour'"),
+        ("unfit", dict(config={**header["config"], "fpn_channels": 9}), "do not match"),
+        ("odd", dict(config={**header["config"], "cell": "wide"}), "has an invalid network config"),
     ):
-        kept = {k: v for k, v in names.items() if k != "__metadata__"}
+        tensors = {k: v for k, v in names.items() if k != "__metadata__"}
         if change:
-            kept["__metadata__"] = {"lidar_perception": json.dumps({**other, **change})}
-        text = json.dumps(kept).encode()
-        cases[name] = (struct.pack("<Q", len(text)) + text + content[8 + length :], words)
-    for name, (raw, words) in cases.items():
-        if raw is not None:
-            (tmp_path / name).write_bytes(raw)
-        with pytest.raises(InputError, match=words) as error:
+            tensors["__metadata__"] = {"lidar_perception": json.dumps({**header, **change})}
+        text = json.dumps(tensors).encode()
+        cases[name] = (struct.pack("<Q", len(text)) + text + content[8 + length :], message)
+    for name, (file_content, message) in cases.items():
+        if file_content is not None:
+            (tmp_path / name).write_bytes(file_content)
+        with pytest.raises(InputError, match=message) as error:
             load_network(tmp_path / name)
         assert "\n" not in str(error.value) and name in str(error.value)
 
 
 def test_full_disk_keeps_the_last_checkpoint(saved, monkeypatch):
     path, header, network = saved
-    before = path.read_bytes()
+    content = path.read_bytes()
 
-    def full(*_):
+    def raise_disk_full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", raise_disk_full)
     with pytest.raises(InputError, match="No space left"):
         save_checkpoint(path, network, header, half=True)
-    assert path.read_bytes() == before and [*path.parent.iterdir()] == [path]
+    assert path.read_bytes() == content and [*path.parent.iterdir()] == [path]
 
 
 def test_model_card_states_the_sensor_of_the_header():
@@ -166,15 +170,15 @@ def test_error_for_missing_weights_explains_how_to_get_them(tmp_path, monkeypatc
     monkeypatch.setattr(weights_file, "POINTPILLARS_WEIGHTS", tmp_path)
     with pytest.raises(InputError, match="no weights for v4 compact"):
         load_detector("", "cpu")
-    wanted = with_values(eager(engine="torch"), {"pointpillars.version": "v1"})
+    params = with_values(eager(engine="torch"), {"pointpillars.version": "v1"})
     config = tiny("v1")
     save_checkpoint(tmp_path / "pointpillars_v1_compact.safetensors", lively(config), Header(config))
-    assert same(load_detector("", "cpu", wanted)(frame()), random_detector("v1")(frame()))
-    named = with_values(
+    assert same(load_detector("", "cpu", params)(frame()), random_detector("v1")(frame()))
+    named_params = with_values(
         eager(engine="torch"), {"pointpillars.weights": str(tmp_path / "pointpillars_v1_compact.safetensors")}
     )
-    assert same(load_detector("", "cpu", named)(frame()), random_detector("v1")(frame()))
-    with pytest.raises(InputError, match="no checkpoint /nowhere"):
+    assert same(load_detector("", "cpu", named_params)(frame()), random_detector("v1")(frame()))
+    with pytest.raises(InputError, match="checkpoint not found: /nowhere"):
         load_detector("", "cpu", with_values(eager(), {"pointpillars.weights": "/nowhere"}))
 
 
@@ -201,8 +205,8 @@ def test_exported_network_gives_the_same_detections(tmp_path):
 def test_export_reads_checkpoints_and_rejects_bad_files(saved, tmp_path, monkeypatch):
     path, _, _ = saved
     out = tmp_path / "o/w.onnx"
-    done = CliRunner().invoke(cli, ["export", "onnx", str(path), "--out", str(out)])
-    assert done.exit_code == 0 and "v4 compact" in " ".join(done.output.split())
+    result = CliRunner().invoke(cli, ["export", "onnx", str(path), "--out", str(out)])
+    assert result.exit_code == 0 and "v4 compact" in " ".join(result.output.split())
     assert same(
         load_detector(out, "cpu", eager())(frame()), load_detector(path, "cpu", eager(engine="torch"))(frame()), 1e-4
     )
@@ -213,8 +217,8 @@ def test_export_reads_checkpoints_and_rejects_bad_files(saved, tmp_path, monkeyp
     with pytest.raises(InputError, match="set engine: auto"):
         load_detector(out, "cpu", eager(engine="sparse"))
     (tmp_path / "bad.onnx").write_bytes(out.read_bytes()[:-50])
-    for name, words in ("bad.onnx", "cannot read"), ("none.onnx", "no exported network"):
-        with pytest.raises(InputError, match=words):
+    for name, message in ("bad.onnx", "cannot read"), ("none.onnx", "exported network not found"):
+        with pytest.raises(InputError, match=message):
             load_detector(tmp_path / name, "cpu")
 
 
@@ -230,27 +234,27 @@ def test_exported_pointnet_gives_the_same_detections(tmp_path, name):
     network.offsets.copy_(torch.arange(4) / 10)
     weights, out = tmp_path / "w.safetensors", tmp_path / "p.onnx"
     save_checkpoint(weights, network, Header(config, {"steps": 3}))
-    done = CliRunner().invoke(cli, ["export", "onnx", str(weights), "--out", str(out)])
-    assert done.exit_code == 0 and f"PointNet {name}" in " ".join(done.output.split())
-    detector, wanted = (
+    result = CliRunner().invoke(cli, ["export", "onnx", str(weights), "--out", str(out)])
+    assert result.exit_code == 0 and f"PointNet {name}" in " ".join(result.output.split())
+    detector, expected_detector = (
         open_detector(file, "cpu", settings={"pointnet.warm_up": False, "pointnet.engine": "torch"})
         for file in (out, weights)
     )
-    assert detector.params == wanted.params
-    assert detector.classifier.header == wanted.classifier.header
+    assert detector.params == expected_detector.params
+    assert detector.classifier.header == expected_detector.classifier.header
     for count in (5, 1):
-        few = clusters.take(np.arange(count))
-        mine, theirs = (d.classifier.predict(few) for d in (detector, wanted))
-        np.testing.assert_allclose(mine.probabilities, theirs.probabilities, atol=1e-5)
-        np.testing.assert_allclose(mine.boxes, theirs.boxes, atol=1e-4)
-    with pytest.raises(InputError, match="runs on the CPU only"):
+        subset = clusters.take(np.arange(count))
+        predictions, expected = (d.classifier.predict(subset) for d in (detector, expected_detector))
+        np.testing.assert_allclose(predictions.probabilities, expected.probabilities, atol=1e-5)
+        np.testing.assert_allclose(predictions.boxes, expected.boxes, atol=1e-4)
+    with pytest.raises(InputError, match="in ONNX Runtime on the CPU"):
         _load_network(out, "cuda", "auto")
 
 
 # weights of other projects
 
 
-def theirs(state, project):
+def convert_to_project(state, project):
     """Convert our state dict to the names and point inputs of another project."""
     names = {
         "OpenPCDet": (
@@ -273,46 +277,47 @@ def theirs(state, project):
     points, blocks, ups, head, convs, first = names[project]
     out = {}
     for name, value in state.items():
-        part = name.split(".")
-        if part[0] == "pillar_net":
-            key = f"{points}.pfn_layers.0.{'.'.join(part[1:])}"
-        elif part[0] == "blocks":
-            key = f"{blocks}.{part[1]}.{first + 3 * int(part[2]) + int(part[3])}.{part[4]}"
-        elif part[0] == "neck":
-            key = f"{ups}.{part[2]}.{part[3]}.{part[4]}"
+        parts = name.split(".")
+        if parts[0] == "pillar_net":
+            key = f"{points}.pfn_layers.0.{'.'.join(parts[1:])}"
+        elif parts[0] == "blocks":
+            key = f"{blocks}.{parts[1]}.{first + 3 * int(parts[2]) + int(parts[3])}.{parts[4]}"
+        elif parts[0] == "neck":
+            key = f"{ups}.{parts[2]}.{parts[3]}.{parts[4]}"
         else:
-            conv = convs[["scores", "codes", "directions"].index(part[1])]
-            key = f"{head}.{conv}.{part[2]}"
+            conv = convs[["scores", "codes", "directions"].index(parts[1])]
+            key = f"{head}.{conv}.{parts[2]}"
         out[key] = value
     return out
 
 
 @pytest.fixture(scope="module")
-def big():
+def full_state():
     """Return a v0 full network with ten inputs per point, as in those projects."""
     return lively(make_config("v0", "full", middle_z=True)).state_dict()
 
 
 @pytest.mark.parametrize(
-    "project, wrapped",
+    "project, wrap",
     [
         ("OpenPCDet", lambda s: {"epoch": 80, "model_state": {**s, "global_step": torch.tensor([5])}}),
         ("mmdetection3d", lambda s: {"meta": {"epoch": 160}, "state_dict": {f"module.{k}": v for k, v in s.items()}}),
     ],
 )
-def test_weights_of_other_projects_are_imported(project, wrapped, big, tmp_path):
+def test_weights_of_other_projects_are_imported(project, wrap, full_state, tmp_path):
     path = tmp_path / "theirs.pth"
-    torch.save(wrapped(theirs(big, project)), path)
+    torch.save(wrap(convert_to_project(full_state, project)), path)
     config, network, name = import_weights(path)
     assert name == project and (config.version, config.size) == ("v0", "full")
     state = network.state_dict()
     linear = "pillar_net.linear.weight"
-    assert all(torch.equal(state[k], v) for k, v in big.items() if k != linear)
-    xyz, rest = torch.randn(50, 3), torch.randn(50, 4)
-    middle = xyz - torch.tensor([3.0, 2.0, -1.0])  # any pillar; z relative to the middle of the range
-    first = middle if project == "mmdetection3d" else xyz  # mmdetection3d overwrites x y z
+    assert all(torch.equal(state[k], v) for k, v in full_state.items() if k != linear)
+    xyz, offsets = torch.randn(50, 3), torch.randn(50, 4)
+    centre_offsets = xyz - torch.tensor([3.0, 2.0, -1.0])  # any pillar; z relative to the middle of the range
+    position = centre_offsets if project == "mmdetection3d" else xyz  # mmdetection3d overwrites x y z
     torch.testing.assert_close(
-        torch.cat([first, rest, middle], dim=1) @ big[linear].T, torch.cat([xyz, rest, middle], dim=1) @ state[linear].T
+        torch.cat([position, offsets, centre_offsets], dim=1) @ full_state[linear].T,
+        torch.cat([xyz, offsets, centre_offsets], dim=1) @ state[linear].T,
     )
     car = config.anchors[config.classes.index("Car")]
     assert car.z == pytest.approx(-1.78 + 1.56 / 2) and config.zero_row
@@ -321,9 +326,9 @@ def test_weights_of_other_projects_are_imported(project, wrapped, big, tmp_path)
     )
 
 
-def test_weights_are_imported_from_the_command_line(big, tmp_path):
-    torch.save(theirs(big, "OpenPCDet"), tmp_path / "a.pth")
-    done = CliRunner().invoke(
+def test_weights_are_imported_from_the_command_line(full_state, tmp_path):
+    torch.save(convert_to_project(full_state, "OpenPCDet"), tmp_path / "a.pth")
+    result = CliRunner().invoke(
         cli,
         [
             "import-weights",
@@ -335,7 +340,7 @@ def test_weights_are_imported_from_the_command_line(big, tmp_path):
             "--half",
         ],
     )
-    assert done.exit_code == 0, done.output
+    assert result.exit_code == 0, result.output
     header = read_header(tmp_path / "a.safetensors")
     assert header.config.classes == ("Cyclist", "Pedestrian", "Car")
     assert header.training == {"imported from": "OpenPCDet", "file": "a.pth"}
@@ -348,31 +353,31 @@ class Code:
         return print, ("run",)
 
 
-def test_files_with_other_content_are_rejected(big, tmp_path, capsys):
-    good = theirs(big, "OpenPCDet")
-    points = "vfe.pfn_layers.0.linear.weight"
+def test_files_with_other_content_are_rejected(full_state, tmp_path, capsys):
+    valid_state = convert_to_project(full_state, "OpenPCDet")
+    linear_name = "vfe.pfn_layers.0.linear.weight"
     cases = [
-        ({**good, "evil": Code()}, (), "weights only"),
+        ({**valid_state, "evil": Code()}, (), "weights_only"),
         ({}, (), "no state_dict"),
         ([1], (), "no state_dict"),
-        ({"a": torch.zeros(2)}, (), points),
-        ({**good, points: good[points][:, :9]}, (), "9 inputs"),
-        ({**good, "roi_head.weight": torch.zeros(3)}, (), "roi_head.weight"),
-        (good, ("Car", "Pedestrian"), "3 classes"),
-        (good, ("Car", "Dog", "Cat"), "Dog"),
-        ({k: v for k, v in good.items() if "blocks.2.7" not in k}, (), "blocks.2.7"),
-        ({**good, "backbone_2d.blocks.0.1.weight": torch.zeros(64, 32, 3, 3)}, (), "blocks.0.0.0.weight"),
+        ({"a": torch.zeros(2)}, (), linear_name),
+        ({**valid_state, linear_name: valid_state[linear_name][:, :9]}, (), "9 inputs"),
+        ({**valid_state, "roi_head.weight": torch.zeros(3)}, (), "roi_head.weight"),
+        (valid_state, ("Car", "Pedestrian"), "3 classes"),
+        (valid_state, ("Car", "Dog", "Cat"), "Dog"),
+        ({k: v for k, v in valid_state.items() if "blocks.2.7" not in k}, (), "blocks.2.7"),
+        ({**valid_state, "backbone_2d.blocks.0.1.weight": torch.zeros(64, 32, 3, 3)}, (), "blocks.0.0.0.weight"),
     ]
-    for content, classes, words in cases:
+    for content, classes, message in cases:
         torch.save(content, tmp_path / "x.pth")
-        with pytest.raises(InputError, match=words) as error:
+        with pytest.raises(InputError, match=message) as error:
             import_weights(tmp_path / "x.pth", classes)
         assert "\n" not in str(error.value)
     (tmp_path / "x.pth").write_bytes(b"no pickle")
     with zipfile.ZipFile(tmp_path / "damaged.pth", "w") as file:  # reads an entry that does not exist
         file.writestr("x/data.pkl", b"\x80\x02R.")
         file.writestr("x/version", "3")
-    for name, words in (("x.pth", "weights only"), ("damaged.pth", "weights only"), ("none.pth", "file not found")):
-        with pytest.raises(InputError, match=words):
+    for name, message in (("x.pth", "weights_only"), ("damaged.pth", "weights_only"), ("none.pth", "file not found")):
+        with pytest.raises(InputError, match=message):
             import_weights(tmp_path / name)
     assert capsys.readouterr().out == ""

@@ -206,7 +206,7 @@ def test_bad_input_is_reported_in_one_line(case, bare, tmp_path, monkeypatch, ca
         expected = "no frame with labels"
     elif case == "weights":
         arguments += ["--weights", tmp_path / "w"]
-        expected = f"there is no checkpoint {tmp_path / 'w'}"
+        expected = f"checkpoint not found: {tmp_path / 'w'}"
     else:
         arguments, expected = ["--data", tmp_path / "none"], f"{tmp_path / 'none'} does not exist"
     assert exit_of(monkeypatch, "compare", *arguments, run=main) == 2

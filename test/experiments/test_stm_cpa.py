@@ -248,7 +248,7 @@ def test_overlaps_of_known_boxes():
     [
         (
             lambda label: re.sub(r"(Pedestrian .*) \S+ \S+ \S+ (\S+)$", r"\1 4.00 -1.00 9.00 \2", label, flags=re.M),
-            "has 0 points",
+            "has only 0 points",
         ),
         (
             lambda label: label + "Car 0.00 0 0.00 0.00 0.00 0.00 0.00 9.00 90.00 90.00 0.00 3.00 20.00 0.00\n",

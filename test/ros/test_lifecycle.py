@@ -205,7 +205,7 @@ def test_simulated_clock_continues_after_cleanup(here, peer):
 
 def test_node_waits_for_missing_network_file(nodes, peer, later, weights):
     """Configuring fails until the file exists; an autostarted node loads it then."""
-    reason = f"there is no checkpoint {later}"
+    reason = f"checkpoint not found: {later}"
     driven, alone = f"waits/{NODE}", f"tries/{NODE}"
     for _ in range(2):
         assert not change(peer, driven, "configure")

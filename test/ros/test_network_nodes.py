@@ -193,7 +193,7 @@ def unshipped_version():
 
 
 UNSHIPPED = unshipped_version()
-MISSING = "there is no checkpoint /nowhere.safetensors"
+MISSING = "checkpoint not found: /nowhere.safetensors"
 UNUSABLE = {  # by detector: function that makes parameters, level, words; more in test_weights.py
     POINTPILLARS_NODE.node: [
         (lambda folder: {"pointpillars.weights": "/nowhere.safetensors"}, 2, MISSING),
@@ -220,7 +220,7 @@ UNUSABLE = {  # by detector: function that makes parameters, level, words; more 
     POINTNET_NODE.node: [
         (lambda folder: {"pointnet.weights": "/nowhere.safetensors"}, 2, MISSING),
         (lambda folder: {"pointnet.weights": str(folder / (300 * "a"))}, 2, "File name too long"),
-        (lambda folder: {"pointnet.weights": str(small_v4(folder))}, 2, "contains a PointPillars for"),
+        (lambda folder: {"pointnet.weights": str(small_v4(folder))}, 2, "contains a PointPillars network for"),
     ],
     FUSED_NODE.node: [(lambda folder: {"fused.weights": "/nowhere.safetensors"}, 2, MISSING)],
 }

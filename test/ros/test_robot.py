@@ -70,7 +70,7 @@ def test_cropped_cloud_gives_the_offline_candidates(processes, peer, cloud):
         lambda: not read_column(clouds[-1], "in_view", everything).any(),
         "a cloud of which nothing is left",
     )
-    peer.wait(lambda: "crop.* leaves none" in peer.get_message("ground_segmentation"), "the reason")
+    peer.wait(lambda: "crop.* removes all of its points" in peer.get_message("ground_segmentation"), "the reason")
 
 
 def test_tilted_sensor_gets_its_mount_from_tf(processes, peer):

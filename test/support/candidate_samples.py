@@ -42,3 +42,9 @@ def scene():
 
 def boxes_at(indices, height=1.8):
     return np.array([[x + 0.05, y, GROUND_Z + height / 2, 0.6, 0.8, height, 0] for x, y in indices])
+
+
+def from_pixels(pixels):
+    """Convert an (80, 32) bool image to (80,) uint32, the inverse of silhouette.to_pixels."""
+    weights = np.uint32(1) << np.arange(32, dtype=np.uint32)
+    return (pixels.astype(np.uint32) * weights).sum(axis=1, dtype=np.uint32)

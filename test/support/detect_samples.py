@@ -52,12 +52,12 @@ class MadeDetector:
     def __call__(self, frame, **columns):
         self.fails(frame)
         self.calls.append(frame)
-        some = float(frame.xyz[:50].mean())
-        boxes = [[8.0, 0.5, -0.85, 0.5, 0.5, 1.7, 0.3], [14.0 + some, -3, -1, 4, 1.7, 1.5, -3.1]]
-        found = Detections.of(boxes, [PEDESTRIAN, CAR], [STRONG, WEAK + abs(some) / 1e3])
-        found = replace(found, sources={"a": np.array([0.5, np.nan], np.float32)})
+        mean = float(frame.xyz[:50].mean())
+        boxes = [[8.0, 0.5, -0.85, 0.5, 0.5, 1.7, 0.3], [14.0 + mean, -3, -1, 4, 1.7, 1.5, -3.1]]
+        detections = Detections.of(boxes, [PEDESTRIAN, CAR], [STRONG, WEAK + abs(mean) / 1e3])
+        detections = replace(detections, sources={"a": np.array([0.5, np.nan], np.float32)})
         problem = f"{len(frame)} points are few" if frame.xyz[0, 0] > 0 else None
-        return DetectionResult(found[found.scores >= self.params.least], problem=problem)
+        return DetectionResult(detections[detections.scores >= self.params.least], problem=problem)
 
 
 def opened(path="", device="auto"):

@@ -7,7 +7,7 @@ import torch
 
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import DetectionResult
-from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
+from lidar_perception.detectors.pointpillars.anchors import get_anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.config import NetworkConfig, make_config
 from lidar_perception.detectors.pointpillars.detector import CPU, PointPillarsDetector
 from lidar_perception.detectors.pointpillars.network import make_network
@@ -41,7 +41,7 @@ def tiny(version: str = "v0", **changes) -> NetworkConfig:
 
 def anchor_tensors(config: NetworkConfig) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the anchors (A, 7) of a network and their classes (A,)."""
-    return torch.from_numpy(make_anchors(config)), torch.from_numpy(anchor_classes(config))
+    return torch.from_numpy(make_anchors(config)), torch.from_numpy(get_anchor_classes(config))
 
 
 def two_objects(seed: int = 0) -> np.ndarray:

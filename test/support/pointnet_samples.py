@@ -10,7 +10,7 @@ from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
 from lidar_perception.detectors.pointnet.clusters import Clusters
 from lidar_perception.detectors.pointnet.config import PointNetConfig, make_pointnet_config
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
-from lidar_perception.detectors.pointnet.network import CONTEXT, PointNet, fuse_norms, make_pointnet
+from lidar_perception.detectors.pointnet.network import CONTEXT, PointNet, fuse_norms
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
 from lidar_perception.detectors.pointnet.torch_network import TorchPointNet
 from lidar_perception.param_fields import with_values
@@ -39,7 +39,7 @@ def lively(config: PointNetConfig, seed: int = 0) -> PointNet:
     """Return a network in eval mode whose norms were updated with random clusters, so that outputs differ between
     clusters."""
     torch.manual_seed(seed)
-    network = make_pointnet(config)
+    network = PointNet(config)
     for module in network.modules():
         if isinstance(module, torch.nn.BatchNorm1d):
             torch.nn.init.uniform_(module.weight, 0.5, 1.5)

@@ -17,7 +17,7 @@ from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.pointnet.clusters import Clusters
 from lidar_perception.detectors.pointnet.config import make_pointnet_config
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
-from lidar_perception.detectors.pointnet.network import make_pointnet
+from lidar_perception.detectors.pointnet.network import PointNet
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
 from lidar_perception.detectors.pointnet.predict import Predictions
 from lidar_perception.geometry import points_in_box, wrap_angle
@@ -242,7 +242,7 @@ def test_clusters_equal_those_of_detector_at_scene_height(rng):
     things = fill_boxes(rng, small_boxes, 6).points
     points = np.concatenate([seen.points, things])
     scene = raise_scene(replace(seen, points=points, height=3.5), SENSOR_HEIGHT - 3.5)
-    classifier = make_classifier(make_pointnet(CONFIG), Header(CONFIG), "torch")
+    classifier = make_classifier(PointNet(CONFIG), Header(CONFIG), "torch")
     read = []
     classifier.network.network.register_forward_pre_hook(lambda _, inputs: read.append(len(inputs[0])))
     detector = PointNetDetector(
@@ -347,7 +347,7 @@ def test_only_background_becomes_reflective(rng):
 
 def test_network_learns_to_classify_clusters(rng):
     torch.manual_seed(0)
-    network, loss = make_pointnet(CONFIG), make_loss(CONFIG, torch.device("cpu"))
+    network, loss = PointNet(CONFIG), make_loss(CONFIG, torch.device("cpu"))
     optimizer = torch.optim.Adam(network.parameters(), 0.01)
     prepare = ClusterPreparation(CONFIG, STILL)
     first = None
@@ -381,7 +381,7 @@ def test_validation_calibrates_and_reports_broken_scenes(rng):
     items = [SceneReader((Source(),), load_validation_clusters)[n] for n in range(2)]
     assert items[1].sample is None and items[1].skipped == ("broken.bin",)
     torch.manual_seed(0)
-    network = make_pointnet(CONFIG).eval()
+    network = PointNet(CONFIG).eval()
     metrics, calibration = validate_network(network, [items[0].sample])
     assert calibration == {}  # one scene is not enough to fit
     assert {"score", "accuracy", "object_accuracy", "calibration_error"} <= set(metrics)

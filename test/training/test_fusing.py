@@ -23,7 +23,7 @@ from lidar_perception.detectors.fused.detector import FusedDetector, Proposals, 
 from lidar_perception.detectors.fused.evidence import compute_probabilities
 from lidar_perception.detectors.fused.fusion import (
     KNOTS,
-    PACKAGE,
+    SHIPPED_FILE,
     find_fused_weights,
     find_fusion,
     load_shipped_models,
@@ -170,14 +170,14 @@ def test_fusion_file_round_trip_in_moved_folder(others, tmp_path, monkeypatch):
     again.classifier.write_bytes(again.classifier.read_bytes() + b"\0")
     assert "pointnet.safetensors, so its scores" in read_fusion(moved / "fused.json").curve_warning
     again.classifier.unlink()
-    with pytest.raises(InputError, match=r"needs .*pointnet.safetensors, which does not exist"):
+    with pytest.raises(InputError, match=r"refers to .*pointnet.safetensors, which does not exist"):
         read_fusion(moved / "fused.json")
 
 
 @pytest.mark.parametrize("curves", [[], 0, "", {}, {"Car": {}}])
 def test_invalid_curves_without_intensity_are_rejected(curves, tmp_path):
     path = tmp_path / "fused.json"
-    path.write_text(json.dumps({**json.loads(PACKAGE.read_text()), "classes_without_intensity": curves}))
+    path.write_text(json.dumps({**json.loads(SHIPPED_FILE.read_text()), "classes_without_intensity": curves}))
     with pytest.raises(InputError, match=r"fused.json was not written by"):
         read_fusion(path)
 
@@ -188,16 +188,16 @@ def test_package_proposer_of_pointnet_is_that_of_fused():
 
 def test_package_curves_warn_about_other_weights(others):
     path, _ = others
-    assert find_fusion().curve_warning is None and check_weights(PACKAGE, 1.73) == []
+    assert find_fusion().curve_warning is None and check_weights(SHIPPED_FILE, 1.73) == []
     assert open_detector("fused", "cpu").warning is None
     other = str(find_pointpillars_weights(PointPillarsParams(version="v1")))
     for params in FusedParams(weights=other), FusedParams(classifier=other):
         assert f"not fitted to {other}" in find_fusion("", params).curve_warning
         assert find_fusion("", params).models == load_shipped_models()
-    with pytest.raises(InputError, match=r"refers to its own PointNet weights; leave fused.classifier"):
+    with pytest.raises(InputError, match=r"already refers to PointNet weights; leave fused.classifier"):
         find_fusion(path, FusedParams(classifier=other))
     for group in "weights", "classifier":
-        with pytest.raises(InputError, match=rf"no checkpoint nowhere; .* fused.{group}"):
+        with pytest.raises(InputError, match=rf"checkpoint not found: nowhere; .* fused.{group}"):
             find_fusion("", FusedParams(**{group: "nowhere"}))
 
 
@@ -208,7 +208,7 @@ def test_missing_class_and_foreign_sensor_are_reported(others):
     del models["Cyclist"]
     write_fusion(path, (None, classifier), models, {})
     never, other = check_weights(path, 1.73)
-    assert never.startswith("fused detects no Cyclist, because it has curves only for")
+    assert never.startswith("fused does not detect Cyclist, because it has curves only for")
     assert str(classifier) in other and "the sensor vlp-16 at 0.6 m" in other
     assert open_detector(path, "cpu").warning == never
 
@@ -231,7 +231,7 @@ def test_damaged_file_is_used_or_rejected_in_one_line(tmp_path):
     rng, path, refused = np.random.default_rng(0), tmp_path / "damaged.json", 0
     evidence = {name: np.array([-9.0, 0.0, np.nan, np.inf]) for name in KNOTS}
     for _ in range(100):
-        path.write_text(mutate_text(PACKAGE.read_text(), rng)[0])
+        path.write_text(mutate_text(SHIPPED_FILE.read_text(), rng)[0])
         try:
             models = read_fusion(path).models
         except InputError as error:

@@ -200,7 +200,7 @@ def test_resumed_run_keeps_plan_and_rejects_other_settings(tmp_path, one_thread)
     assert record["sensor"] == {"name": str(sensor), "height": 0.6, "beams": 5}
     header = read_header(out / "last.safetensors")
     assert header.find_height_mismatch(0.7) is None
-    assert "at 0.6 m, used with one at 1.73 m" in header.find_height_mismatch(1.73)
+    assert "at 0.6 m, but used with a sensor at 1.73 m" in header.find_height_mismatch(1.73)
     plan = json.loads((out / RUN).read_text())["plan"]
     assert (plan["scans"], plan["steps"]) == (2, 2)
     other = CliRunner().invoke(cli, [*arguments, "--resume"])

@@ -12,7 +12,7 @@ from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet.config import NETWORKS
 from lidar_perception.detectors.pointnet.network import load_pointnet
-from lidar_perception.detectors.weights_file import find_judge_weights
+from lidar_perception.detectors.weights_file import find_classifier_weights
 from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.training.params import PointNetTraining
@@ -80,7 +80,10 @@ def test_proposer_is_recorded_and_must_be_pointpillars(cache, tmp_path):
     assert result.exit_code == 0, result.output
     training = read_header(tmp_path / "run/last.safetensors").training
     assert training["params"]["proposer"] == "package"
-    for file, words in ((tmp_path / "none", "no checkpoint"), (find_judge_weights(), "not a PointPillars checkpoint")):
+    for file, words in (
+        (tmp_path / "none", "checkpoint not found"),
+        (find_classifier_weights(), "not a PointPillars checkpoint"),
+    ):
         result = train(cache, tmp_path / "bad", **{"--proposer": file})
         assert isinstance(result.exception, InputError) and words in str(result.exception)
         assert not (tmp_path / "bad").exists()

@@ -9,7 +9,7 @@ from detection_samples import BOXES, tiny, two_objects
 from training_toy import STILL
 
 from lidar_perception.classes import CAR
-from lidar_perception.detectors.pointpillars.network import channels_last, make_network
+from lidar_perception.detectors.pointpillars.network import make_network, to_channels_last
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.params import LoopParams
 from lidar_perception.training.pointpillars.task import ScenePreparation, make_loss
@@ -30,7 +30,7 @@ def run_on(device: str, version: str, amp: str) -> tuple[Run, list]:
     )
     batch = [ScenePreparation(config, STILL)(scene, np.random.default_rng(0))] * 2
     place = torch.device(device)
-    network = channels_last(make_network(config).to(place))
+    network = to_channels_last(make_network(config).to(place))
     params = LoopParams(steps=40, batch=2, lr=0.01, amp=amp)
     return Run(
         Task(network, make_loss(config, place), lambda step: [], lambda module: ({}, {}), lambda *_: None, 1),

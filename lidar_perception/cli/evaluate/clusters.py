@@ -10,7 +10,7 @@ import click
 from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import ScoringOptions, no_labels_error, path_option, scoring_options
 from lidar_perception.cli.options import Algorithm, Settings, apply_values, settings_options
-from lidar_perception.detectors.open import POINTNET, default_params, resolve_weights
+from lidar_perception.detectors.open import POINTNET, make_default_params, resolve_weights
 from lidar_perception.detectors.weights_file import POINTNET_WEIGHTS
 from lidar_perception.param_fields import collect_fields
 from lidar_perception.runs.terminal import console
@@ -27,7 +27,7 @@ def _find_checkpoint(weights: Path | None) -> Path:
 
 def _make_algorithm(weights: Path | None) -> Algorithm:
     """Return the ground and clustering parameters that the network was trained with."""
-    fields = collect_fields(default_params(_find_checkpoint(weights)))
+    fields = collect_fields(make_default_params(_find_checkpoint(weights)))
     return Algorithm(
         "ground and clustering",
         {name: f for name, f in fields.items() if name.startswith(("ground.", "clustering."))},
@@ -60,7 +60,7 @@ def clusters(options: ScoringOptions, weights: Path | None, settings: Settings) 
 
     file = _find_checkpoint(weights)
     (values,) = settings.resolve(_make_algorithm(weights)) if settings else [{}]
-    apply_values(default_params(file), values)
+    apply_values(make_default_params(file), values)
     scores = ClusterScores(read_header(file, PointNetConfig).config.classes)
     recording = options.open_recording(BOXES)
     options.fill(scores, recording, partial(measure_network, file, values))

@@ -57,9 +57,9 @@ class Proposals(NamedTuple):
         evidence: log-odds (K,) of each source.
         obstacles: (N, 3) xyz of the points of the view that are not ground.
         surface: ground surface before flattening.
-        problem: reason why little or nothing can be detected, or None.
-        timings: milliseconds of each step.
-        models: curves for this cloud.
+        problem: reason why few or no objects can be detected, or None.
+        timings: duration of each step in milliseconds.
+        models: curves used for this cloud.
     """
 
     detections: Detections
@@ -72,15 +72,15 @@ class Proposals(NamedTuple):
 
 
 class FusedDetector(NetworkDetector):
-    """Detector that combines two networks, see contract.py.
+    """Detector that combines two networks, see contract.Detector.
 
-    Range and classes are those of the proposer. Ground and the clusters for PointPillars are
-    computed if they are None.
+    Range and classes are those of the proposer. If a call passes no ground or no clusters for
+    PointPillars, they are computed.
 
     Args:
         proposer, classifier: the networks.
-        models: curves that convert evidence, with raw scores of the proposer, to probabilities;
-            None: the shipped ones.
+        models: curves that map the evidence, including raw proposer scores, to probabilities; None:
+            the shipped ones.
         models_without_intensity: curves for clouds without usable intensity; None: `models`.
     """
 
@@ -115,22 +115,22 @@ class FusedDetector(NetworkDetector):
         return other
 
     def with_raw_scores(self) -> FusedDetector:
-        """Return this detector, whose scores have no further calibration."""
+        """Return this detector, because its scores are not calibrated afterwards."""
         return self
 
     def detect(self, frame: PointCloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None) -> DetectionResult:
         begin = perf_counter()
         extended_view = self._make_view(frame)
-        preprocess = perf_counter() - begin
+        preprocess_s = perf_counter() - begin
         proposals = self._propose(extended_view, ground, cluster_ids, self.settings.scores)
         begin = perf_counter()
-        detections, best = self.decide(proposals)
+        detections, best_scores = self.decide(proposals)
         detections = restore_detections(detections, self.params.ground.sensor_pose)
-        timings = {STEPS[0]: preprocess * 1e3, **proposals.timings, STEPS[-1]: (perf_counter() - begin) * 1e3}
-        return DetectionResult(detections, timings, proposals.problem or self.fallback, best)
+        timings = {STEPS[0]: preprocess_s * 1e3, **proposals.timings, STEPS[-1]: (perf_counter() - begin) * 1e3}
+        return DetectionResult(detections, timings, proposals.problem or self.fallback, best_scores)
 
     def _make_view(self, frame: PointCloud) -> NormalizedView:
-        """Make the view of the network's range, extended by MAX_RELIEF_M upwards and downwards."""
+        """Make a view of the proposer's range, extended by MAX_RELIEF_M upwards and downwards."""
         config, relief = self.proposer.config, np.array([0, 0, MAX_RELIEF_M])
         return NormalizedView.of(
             frame,
@@ -141,7 +141,7 @@ class FusedDetector(NetworkDetector):
         )
 
     def propose(self, frame: PointCloud) -> Proposals:
-        """Return all proposals for a cropped frame, with the evidence of all sources."""
+        """Return all proposals for a cropped frame with the evidence of all sources."""
         return self._propose(self._make_view(frame))
 
     def _propose(
@@ -151,10 +151,11 @@ class FusedDetector(NetworkDetector):
         cluster_ids: np.ndarray | None = None,
         min_scores: ScoreParams = ScoreParams.for_all_classes(0.0),
     ) -> Proposals:
-        """Return the proposals for the result of _make_view(), with the evidence of all sources.
+        """Return the proposals for the result of _make_view() with the evidence of all sources.
 
         Args:
-            min_scores: PointNet, the slowest step, skips proposals that cannot reach these scores.
+            min_scores: proposals that cannot reach these scores are not classified by PointNet, the
+                slowest step.
         """
         times = [perf_counter()]
         settings, params, config = self.settings, self.params, self.proposer.config
@@ -163,7 +164,7 @@ class FusedDetector(NetworkDetector):
         is_ground = segment_view_ground(view.frame, params.ground) if ground is None else ground.take(view.indices)
         surface = fit_ground_surface(view.frame.xyz.compress(is_ground, axis=0), -SENSOR_HEIGHT)
         flat_view = extended_view.flatten(surface).crop(config.low, config.high)
-        is_flat_ground = view.convert(is_ground, flat_view)
+        is_flat_ground = view.transfer(is_ground, flat_view)
         assert is_flat_ground is not None
         obstacles = flat_view.frame.take(np.flatnonzero(~is_flat_ground))
         ground_points = flat_view.frame.xyz.compress(is_flat_ground, axis=0)
@@ -176,40 +177,40 @@ class FusedDetector(NetworkDetector):
             _, cluster_ids = run_experts(
                 view.frame, config, is_ground, view.take(cluster_ids), params.ground, params.clustering
             )
-            proposal = self.proposer.propose(
+            proposal_result = self.proposer.propose(
                 flat_view,
                 is_flat_ground,
-                view.convert(cluster_ids, flat_view),
+                view.transfer(cluster_ids, flat_view),
                 ScoreParams.for_all_classes(settings.proposals),
                 replace(settings.nms, max_boxes=settings.max_proposals),
                 settings.cpu_fallback,
             )
             people_ids = clusters.result()[~is_flat_ground]
         times.append(perf_counter())
-        proposed = drop_ego_vehicle(proposal.detections, view.pose.height)
+        proposals = drop_ego_vehicle(proposal_result.detections, view.pose.height)
         evidence = {
-            "network": to_log_odds(proposed.scores),
+            "network": to_log_odds(proposals.scores),
             "silhouette": to_log_odds(
-                find_silhouette_confidence(proposed.boxes, obstacles.xyz, ground_points, people_ids)
+                find_silhouette_confidence(proposals.boxes, obstacles.xyz, ground_points, people_ids)
             ),
         }
-        max_scores = compute_max_probabilities(models, proposed.class_ids, evidence, "classifier")
-        probability, boxes = self.classifier.classify(
-            proposed,
+        max_scores = compute_max_probabilities(models, proposals.class_ids, evidence, "classifier")
+        probabilities, classifier_boxes = self.classifier.classify(
+            proposals,
             obstacles,
             ground_points,
-            min_scores.passes(replace(proposed, scores=max_scores)),
+            min_scores.passes(replace(proposals, scores=max_scores)),
             settings.cpu_fallback,
         )
-        evidence["classifier"] = to_log_odds(probability)
-        boxes = move_towards(proposed.boxes, boxes, settings.classifier_box).astype(np.float32)
+        evidence["classifier"] = to_log_odds(probabilities)
+        boxes = move_towards(proposals.boxes, classifier_boxes, settings.classifier_box).astype(np.float32)
         times.append(perf_counter())
         return Proposals(
-            replace(proposed, boxes=boxes),
+            replace(proposals, boxes=boxes),
             evidence,
             obstacles.xyz,
             surface,
-            proposal.problem,
+            proposal_result.problem,
             dict(zip(STEPS[1:], (np.diff(times) * 1e3).tolist())),
             models,
         )
@@ -218,25 +219,27 @@ class FusedDetector(NetworkDetector):
         """Convert proposals to detections.
 
         Returns:
-            Detections in the coordinates of the view, best first; and the highest score of each
-            class if there are none.
+            Detections in the coordinates of the view, highest score first; and the highest score of
+            each class if there are no detections, otherwise empty.
         """
         settings, class_ids = self.settings, proposals.detections.class_ids
-        scored = replace(
+        candidates = replace(
             proposals.detections,
             scores=compute_probabilities(proposals.models, class_ids, proposals.evidence),
             sources=compute_source_probabilities(proposals.models, class_ids, proposals.evidence),
         )
-        selected = scored[settings.scores.passes(scored)]
-        if len(selected) == 0:
-            return selected, {
-                name: float(scored.scores[class_ids == CLASSES.index(name)].max(initial=0.0)) for name in self.classes
+        detections = candidates[settings.scores.passes(candidates)]
+        if len(detections) == 0:
+            return detections, {
+                name: float(candidates.scores[class_ids == CLASSES.index(name)].max(initial=0.0))
+                for name in self.classes
             }
-        boxes = move_cars_to_points(selected.boxes, selected.class_ids, proposals.obstacles, settings.on_points)
-        heights = proposals.surface.height_at(boxes)
-        boxes[:, 2] += heights + SENSOR_HEIGHT
-        moved = replace(selected, boxes=move_to_ground(boxes, heights, settings.on_ground).astype(np.float32))
-        return moved[remove_duplicates(moved, settings)], {}
+        boxes = move_cars_to_points(detections.boxes, detections.class_ids, proposals.obstacles, settings.on_points)
+        ground_heights = proposals.surface.height_at(boxes)
+        boxes[:, 2] += ground_heights + SENSOR_HEIGHT
+        boxes = move_to_ground(boxes, ground_heights, settings.on_ground).astype(np.float32)
+        detections = replace(detections, boxes=boxes)
+        return detections[remove_duplicates(detections, settings)], {}
 
     def warm_up(self) -> None:
         """Run every step once on synthetic points to trigger JIT compilation."""
@@ -244,21 +247,21 @@ class FusedDetector(NetworkDetector):
 
 
 def remove_duplicates(detections: Detections, params: FusedParams) -> np.ndarray:
-    """Return the indices (M,) int64 of one detection per object, best score first.
+    """Return the indices (M,) int64 of one detection per object, highest score first.
 
-    Two detections of a class are duplicates if their IoU is above nms.iou. Cars are duplicates also
-    if their IoU is above same_car, pedestrians and cyclists if their centres are closer than
-    same_place.
+    Two detections of the same class are duplicates if their IoU is above nms.iou. Cars are also
+    duplicates if their IoU is above same_car, and pedestrians and cyclists if the distance between
+    their centres is less than same_place.
     """
     order = rotated_nms(
         detections.boxes, detections.scores, detections.class_ids, params.nms.iou, params.nms.across_classes
     )
     boxes, class_ids = detections.boxes[order], detections.class_ids[order]
-    duplicate = (centre_distances(boxes, boxes) < params.same_place) & (class_ids[:, None] == class_ids)
+    is_duplicate = (centre_distances(boxes, boxes) < params.same_place) & (class_ids[:, None] == class_ids)
     cars = np.flatnonzero(class_ids == CAR)
-    duplicate[cars] = False
-    duplicate[np.ix_(cars, cars)] = bev_iou(boxes[cars], boxes[cars]) > params.same_car
-    return order[keep_first(duplicate)][: params.nms.max_boxes]
+    is_duplicate[cars] = False
+    is_duplicate[np.ix_(cars, cars)] = bev_iou(boxes[cars], boxes[cars]) > params.same_car
+    return order[keep_first(is_duplicate)][: params.nms.max_boxes]
 
 
 def load_fused_detector(
@@ -267,8 +270,8 @@ def load_fused_detector(
     """Load the fused detector.
 
     Args:
-        path: output of `train fused`, or weights of PointPillars; empty: files named in `params`,
-            by default the shipped ones.
+        path: output of `train fused`, or weights of PointPillars; empty: the files named in
+            `params`, by default the shipped ones.
 
     Raises:
         InputError: see find_fusion, load_detector and load_pointnet_detector.

@@ -1,12 +1,13 @@
-"""Evidence for proposals, and its combination to a probability.
+"""Evidence for proposals, and its combination into a probability.
 
-The sources are PointPillars' score, the silhouettes of clusters near the centre, and the
-classification of the points by PointNet. All coordinates are those of a level sensor at
-SENSOR_HEIGHT. Clusters without a proposal are ignored: they did not improve the detections.
+There are three sources: PointPillars' score, the silhouettes of clusters near the proposal's
+centre, and PointNet's classification of its points. Coordinates are those of a level sensor at
+SENSOR_HEIGHT. Clusters without a proposal are ignored because using them did not improve the
+detections.
 
-The log-odds of a class are the sum of one curve per source. The sources are not independent, so a
-plain sum of log-odds would be overconfident. The curves are therefore fitted jointly, on simulated
-scans outside the training sets, which makes the result a calibrated probability.
+The log-odds of a class are the sum of one curve per source. The sources are not independent, so
+simply adding their log-odds would be overconfident. The curves are therefore fitted jointly, on
+simulated scans outside the training sets, which makes the result a calibrated probability.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.groups import group_points
 from lidar_perception.types import CLASSES
 
-# Size limits of clusters that may be a person or a cyclist.
+# Size limits of clusters that may be a pedestrian or a cyclist.
 MIN_HEIGHT_M, MAX_HEIGHT_M, MAX_LENGTH_M = 0.8, 2.6, 2.8
 MAX_DISTANCE_M = 0.6  # maximum distance between the centres of a proposal and its cluster
-MIN_PROBABILITY, MAX_PROBABILITY = 0.001, 0.999  # limits for every source
+MIN_PROBABILITY, MAX_PROBABILITY = 0.001, 0.999  # each source's probability is clipped to this interval
 
-# Source -> log-odds (K,) float64 that each of K proposals has the proposed class; NaN where
-# the source gives no evidence.
+# Source -> log-odds (K,) float64 that each of K proposals is an object of the proposed class; NaN
+# where the source provides no evidence.
 Evidence = dict[str, np.ndarray]
 
 
@@ -43,27 +44,27 @@ def find_silhouette_confidence(
         boxes: (K, 7) proposals.
         xyz: (N, 3) points that are not ground.
         ground: (G, 3) ground points.
-        cluster_ids: (N,) 1..J, 0 for no cluster, computed with the parameters for people.
+        cluster_ids: (N,) 1..J, 0 for no cluster, computed with the parameters `people`.
 
     Returns:
         (K,) float64, 0..1; 0 for boxes without a cluster of a suitable size.
     """
     clusters = snap_to_ground(fit_boxes(xyz, cluster_ids, BEST.boxes.shape), fit_plane(ground))
-    chosen = np.flatnonzero(
+    indices = np.flatnonzero(
         (clusters[:, 5] >= MIN_HEIGHT_M)
         & (clusters[:, 5] <= MAX_HEIGHT_M)
         & (clusters[:, 3:5].max(axis=1, initial=0.0) <= MAX_LENGTH_M)
     )
-    is_near = centre_distances(boxes, clusters[chosen]) <= MAX_DISTANCE_M
+    is_near = centre_distances(boxes, clusters[indices]) <= MAX_DISTANCE_M
     has_box = is_near.any(axis=0)
-    chosen, is_near = chosen[has_box], is_near[:, has_box]
-    points, start = group_points(xyz, cluster_ids, chosen + 1)
-    confidences = compute_confidence(compute_shape_features(points, start, clusters[chosen], BEST))
+    indices, is_near = indices[has_box], is_near[:, has_box]
+    points, start = group_points(xyz, cluster_ids, indices + 1)
+    confidences = compute_confidence(compute_shape_features(points, start, clusters[indices], BEST))
     return (is_near * confidences).max(axis=1, initial=0.0)
 
 
 def to_log_odds(probabilities: np.ndarray) -> np.ndarray:
-    """Convert probabilities (K,), clipped, to log-odds (K,) float64; NaN remains NaN."""
+    """Clip probabilities (K,) and convert them to log-odds (K,) float64; NaN remains NaN."""
     return logit(np.clip(np.asarray(probabilities, np.float64), MIN_PROBABILITY, MAX_PROBABILITY))
 
 
@@ -86,9 +87,9 @@ def compute_probabilities(models: Models, class_ids: np.ndarray, evidence: Evide
 
 
 def compute_max_probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence, source: str) -> np.ndarray:
-    """Return the upper bound (K,) float32 of the probability over all possible evidence of `source`.
+    """Return upper bounds (K,) float32 of the probabilities over all possible evidence of `source`.
 
-    A curve is piecewise linear and constant beyond its knots, so its maximum is at a knot or is its
+    A curve is piecewise linear and constant beyond its knots, so its maximum is at a knot or is the
     value for missing evidence.
     """
     best_evidence = np.full(len(class_ids), np.nan)
@@ -100,9 +101,9 @@ def compute_max_probabilities(models: Models, class_ids: np.ndarray, evidence: E
 
 
 def compute_source_probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence) -> dict[str, np.ndarray]:
-    """Return, by source, the probability (K,) float32 from this source alone.
+    """Return the probability (K,) float32 that each source alone gives the proposals, by source.
 
-    NaN: the source gives no evidence, or the model of the class does not use it.
+    It is NaN where the source provides no evidence or the model of the class does not use it.
     """
     class_ids_by_source = {
         source: [i for i, name in enumerate(CLASSES) if source in models.get(name, {"curves": {}})["curves"]]

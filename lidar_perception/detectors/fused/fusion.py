@@ -1,6 +1,7 @@
 """Fusion files: the two networks of the fused detector and the curves that combine their scores.
 
-`train fused` writes such a file; fusion.json ships with the package. Reading does not import torch.
+`train fused` writes fusion files; fusion.json is shipped with the package. Reading does not import
+torch.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from lidar_perception.classes import DETECTED
 from lidar_perception.detectors.fused.params import FusedParams
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
-from lidar_perception.detectors.weights_file import find_judge_weights, find_proposer_weights, require_weights
+from lidar_perception.detectors.weights_file import find_classifier_weights, find_proposer_weights, require_weights
 from lidar_perception.runs.files import read_text, shorten_error, write_text
 from lidar_perception.types import InputError
 
-PACKAGE = Path(__file__).with_name("fusion.json")
+SHIPPED_FILE = Path(__file__).with_name("fusion.json")
 WITHOUT_INTENSITY = "classes_without_intensity"  # key of the curves for clouds without intensity
 SUFFIX = ".json"  # suffix of fusion files
 MAX_BYTES = 10**6
@@ -49,7 +50,7 @@ class Fusion:
         proposer, classifier: weights of PointPillars and of PointNet.
         digests: sha256 of the weights that `models` were fitted to.
         models: curves by class.
-        fitted_to: data and numbers of proposals of the fit.
+        fitted_to: data and numbers of proposals that the curves were fitted to.
         models_without_intensity: curves for clouds without intensity; None: `models`.
     """
 
@@ -62,16 +63,16 @@ class Fusion:
 
     @property
     def curve_warning(self) -> str | None:
-        """Warning if the curves were fitted to other weights, or None."""
-        refitted = [
+        """Warning if the curves were fitted to different weights, or None."""
+        unknown_files = [
             str(path)
             for path, digest in zip((self.proposer, self.classifier), self.digests)
             if compute_digest(path) != digest
         ]
-        if not refitted:
+        if not unknown_files:
             return None
         return (
-            f"the curves of fused were not fitted to {' and '.join(refitted)}, so its scores are not "
+            f"the curves of fused were not fitted to {' and '.join(unknown_files)}, so its scores are not "
             "calibrated probabilities; fit the curves with `lidar-perception train fused`"
         )
 
@@ -82,9 +83,9 @@ class Fusion:
             classes: classes of the proposer.
         """
         warnings = [self.curve_warning] if self.curve_warning else []
-        if missing := [name for name in classes if name not in self.models]:
+        if missing_classes := [name for name in classes if name not in self.models]:
             warnings.append(
-                f"fused detects no {' and no '.join(missing)}, because it has curves only for "
+                f"fused does not detect {' and '.join(missing_classes)}, because it has curves only for "
                 f"{', '.join(self.models)}; use {self.proposer} alone to detect them"
             )
         return warnings
@@ -99,7 +100,7 @@ def find_fusion(path: str | Path = "", params: FusedParams = FusedParams()) -> F
     """Find the networks and curves of the fused detector.
 
     Args:
-        path: a fusion file, or PointPillars' weights, which are used with the shipped curves;
+        path: a fusion file, or weights of PointPillars, which are used with the shipped curves;
             empty: `params.weights`.
 
     Raises:
@@ -108,9 +109,9 @@ def find_fusion(path: str | Path = "", params: FusedParams = FusedParams()) -> F
     name = str(path) if str(path) not in ("", ".") else params.weights
     if name.endswith(SUFFIX):
         if params.classifier:
-            raise InputError(f"{name} refers to its own PointNet weights; leave fused.classifier empty")
+            raise InputError(f"{name} already refers to PointNet weights; leave fused.classifier empty")
         return read_fusion(require_weights(name, "fused.weights"))
-    shipped = read_fusion(PACKAGE)
+    shipped = read_fusion(SHIPPED_FILE)
     return replace(
         shipped,
         proposer=require_weights(name, "fused.weights") if name else shipped.proposer,
@@ -119,10 +120,10 @@ def find_fusion(path: str | Path = "", params: FusedParams = FusedParams()) -> F
 
 
 def find_fused_weights(params: FusedParams) -> Path:
-    """Return the path `params.weights`, by default the shipped weights of PointPillars.
+    """Return `params.weights`, by default the path of the shipped weights of PointPillars.
 
     Raises:
-        InputError: this file or another part of the detector is missing.
+        InputError: this file or another file of the detector is missing.
     """
     fusion = find_fusion("", params)
     return Path(params.weights) if params.weights else fusion.proposer
@@ -130,8 +131,8 @@ def find_fused_weights(params: FusedParams) -> Path:
 
 @cache
 def load_shipped_models() -> Models:
-    """Load the curves that ship with the package."""
-    return json.loads(PACKAGE.read_text())["classes"]
+    """Load the curves that are shipped with the package."""
+    return json.loads(SHIPPED_FILE.read_text())["classes"]
 
 
 def read_fusion(path: Path) -> Fusion:
@@ -149,7 +150,7 @@ def read_fusion(path: Path) -> Fusion:
         if models_without_intensity is not None:
             _check_models(models_without_intensity)
             if set(models_without_intensity) != set(models):
-                raise ValueError(f"{WITHOUT_INTENSITY} has other classes")
+                raise ValueError(f"{WITHOUT_INTENSITY} has different classes than `classes`")
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
@@ -157,10 +158,10 @@ def read_fusion(path: Path) -> Fusion:
     proposer, classifier = (
         path.parent / file if file else default for file, default in zip(files, _find_shipped_weights())
     )
-    for part in (proposer, classifier):
-        if not part.is_file():
+    for weights in (proposer, classifier):
+        if not weights.is_file():
             raise InputError(
-                f"{path} needs {part}, which does not exist; restore the file, or run "
+                f"{path} refers to {weights}, which does not exist; restore the file, or run "
                 "`lidar-perception train fused` again"
             )
     return Fusion(proposer, classifier, (digests[0], digests[1]), models, fitted_to, models_without_intensity)
@@ -176,7 +177,7 @@ def write_fusion(
     """Write a fusion file, which refers to the weights by relative paths.
 
     Args:
-        weights: files of PointPillars and PointNet; None: the shipped one.
+        weights: weights of PointPillars and of PointNet; None: the shipped ones.
 
     Raises:
         InputError: the file cannot be written.
@@ -189,8 +190,8 @@ def write_fusion(
 
 
 def _find_shipped_weights() -> tuple[Path, Path]:
-    """Return the paths of the shipped weights of both networks. InputError if they are missing."""
-    return find_proposer_weights(), find_judge_weights()
+    """Return the paths of the shipped weights of both networks; raise InputError if they are missing."""
+    return find_proposer_weights(), find_classifier_weights()
 
 
 def _check_models(models: Any) -> None:
@@ -205,14 +206,14 @@ def _check_models(models: Any) -> None:
             knots, values = _parse_log_odds(curve["knots"]), _parse_log_odds(curve["values"])
             _parse_log_odds([curve.get("unknown", 0.0)])
             if len(knots) != len(values) or not (np.diff(knots) > 0).all() or not (np.diff(values) >= 0).all():
-                raise ValueError(f"the curve of {source} is not increasing")
+                raise ValueError(f"knots and values of the curve of {source} must be increasing")
 
 
 def _parse_log_odds(values: Any) -> np.ndarray:
-    """Convert log-odds to (K,) float64. ValueError if they are invalid or above MAX_LOG_ODDS."""
+    """Convert log-odds to (K,) float64; raise ValueError if they are invalid."""
     if not all(type(value) in (int, float) for value in values):
         raise ValueError("log-odds must be numbers")
-    numbers = np.array(values, np.float64)
-    if not 0 < len(numbers) <= MAX_KNOTS or not (np.abs(numbers) <= MAX_LOG_ODDS).all():
-        raise ValueError(f"log-odds must be numbers up to {MAX_LOG_ODDS:g}")
-    return numbers
+    log_odds = np.array(values, np.float64)
+    if not 0 < len(log_odds) <= MAX_KNOTS or not (np.abs(log_odds) <= MAX_LOG_ODDS).all():
+        raise ValueError(f"expected 1 to {MAX_KNOTS} log-odds between -{MAX_LOG_ODDS:g} and {MAX_LOG_ODDS:g}")
+    return log_odds

@@ -25,13 +25,12 @@ STEPS = ("preprocess", "ground", "proposals", "evidence", "fusion")  # keys of t
 
 @dataclass(frozen=True)
 class FusedParams(NetworkParams):
-    """Networks, fusion and thresholds. A score is the probability that the object exists."""
+    """Networks, fusion and thresholds. A score is the probability that the object is real."""
 
     weights: str = param(
         "",
-        "Output of `train fused`, which refers to both networks; a checkpoint "
-        "of PointPillars; or a class of your own, module:Class. Empty: the "
-        "shipped weights.",
+        "Output of `train fused`, which refers to both networks; a PointPillars "
+        "checkpoint; or your own class, module:Class. Empty: the shipped weights.",
         fixed=True,
     )
 
@@ -43,14 +42,18 @@ class FusedParams(NetworkParams):
     max_proposals: int = param(200, "Maximum number of proposed boxes; the best scores are kept.", low=1, high=10_000)
     nms: NmsParams = NmsParams(candidates=1000)
     same_place: float = param(
-        0.6, "Pedestrians, and cyclists, with centres closer than this are duplicates.", unit="m", low=0.0, high=10.0
+        0.6,
+        "Two pedestrians or two cyclists whose centres are closer than this are duplicates.",
+        unit="m",
+        low=0.0,
+        high=10.0,
     )
-    same_car: float = param(0.02, "Cars with a bird's-eye-view IoU above this are duplicates.", low=0.0, high=1.0)
+    same_car: float = param(0.02, "Two cars with a bird's-eye-view IoU above this are duplicates.", low=0.0, high=1.0)
     classifier_box: float = param(
         0.5, "Weight of PointNet's box in the result. 0: PointPillars' box, 1: PointNet's box.", low=0.0, high=1.0
     )
     on_ground: float = param(
-        0.25, "Move boxes towards the ground around them. 0: not at all, 1: onto it.", low=0.0, high=1.0
+        0.25, "Move boxes vertically towards the ground. 0: not at all, 1: onto the ground.", low=0.0, high=1.0
     )
     on_points: float = make_on_points_param()
 
@@ -60,7 +63,7 @@ class FusedDetectorParams:
     """All parameter groups of the detector.
 
     `ground` applies to all stages, `clustering` to PointPillars' cluster map, and `people` to the
-    clusters whose silhouettes are compared with pedestrians.
+    clusters whose silhouettes are evidence for pedestrians.
     """
 
     input: InputParams = InputParams()

@@ -2,8 +2,8 @@
 
 A box is encoded in the normalized frame of clusters.py as
 
-- the centre of the object relative to the mean of its points, metres;
-- the log of length, width and height relative to the mean of the class;
+- the centre of the box relative to the mean of the points, in metres;
+- the logarithm of length, width and height relative to the reference size of the class;
 - a yaw bin, and the residual -1..1 in units of half a bin.
 """
 
@@ -21,10 +21,10 @@ Array = TypeVar("Array")  # NumPy array or torch tensor
 
 
 class Outputs(NamedTuple, Generic[Array]):
-    """Output of a network for B clusters.
+    """Outputs of a network for B clusters.
 
     Attributes:
-        logits: (B, K + 1), background last.
+        logits: (B, K + 1), with the background last.
         centres, sizes: (B, 3).
         yaw_bins, yaw_residuals: (B, Y) with Y bins.
     """
@@ -58,19 +58,22 @@ def encode(
 
     Args:
         labels: (K,) indices into config.classes.
-        centres, azimuths: (K, 3) and (K,) of the clusters, see ClusterInput.
+        centres: (K, 3) means of the clusters, see ClusterInput.
+        azimuths: (K,) azimuths of the clusters, see ClusterInput.
     """
-    offset = boxes[:, :3] - centres
+    offsets = boxes[:, :3] - centres
     cos, sin = np.cos(azimuths), np.sin(azimuths)
-    rotated = np.column_stack(
-        [cos * offset[:, 0] + sin * offset[:, 1], cos * offset[:, 1] - sin * offset[:, 0], offset[:, 2]]
+    normalized_offsets = np.column_stack(
+        [cos * offsets[:, 0] + sin * offsets[:, 1], cos * offsets[:, 1] - sin * offsets[:, 0], offsets[:, 2]]
     )
-    sizes = np.log(np.maximum(boxes[:, 3:6], 0.05) / np.array(config.sizes)[labels])
-    width = 2 * np.pi / config.yaw_bins
+    log_sizes = np.log(np.maximum(boxes[:, 3:6], 0.05) / np.array(config.sizes)[labels])
+    bin_width = 2 * np.pi / config.yaw_bins
     yaw = np.mod(boxes[:, 6] - azimuths, 2 * np.pi)
-    bins = np.mod(np.round(yaw / width).astype(np.int64), config.yaw_bins)
-    residuals = wrap_angle(yaw - bins * width) / (width / 2)
-    return BoxTargets(rotated.astype(np.float32), sizes.astype(np.float32), bins, residuals.astype(np.float32))
+    bins = np.mod(np.round(yaw / bin_width).astype(np.int64), config.yaw_bins)
+    residuals = wrap_angle(yaw - bins * bin_width) / (bin_width / 2)
+    return BoxTargets(
+        normalized_offsets.astype(np.float32), log_sizes.astype(np.float32), bins, residuals.astype(np.float32)
+    )
 
 
 def decode(
@@ -91,7 +94,7 @@ def decode(
     boxes[:, 1] = inputs.centres[:, 1] + sin * centres[:, 0] + cos * centres[:, 1]
     boxes[:, 2] = inputs.centres[:, 2] + centres[:, 2]
     boxes[:, 3:6] = np.array(config.sizes)[labels] * np.exp(np.clip(log_sizes, -2, 2))
-    width = 2 * np.pi / config.yaw_bins
-    residual = np.clip(residuals[np.arange(len(bins)), bins], -1, 1)
-    boxes[:, 6] = wrap_angle(inputs.azimuths + (bins + residual / 2) * width)
+    bin_width = 2 * np.pi / config.yaw_bins
+    bin_residuals = np.clip(residuals[np.arange(len(bins)), bins], -1, 1)
+    boxes[:, 6] = wrap_angle(inputs.azimuths + (bins + bin_residuals / 2) * bin_width)
     return boxes.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Temperature calibration: a score of 0.8 is correct in 80 % of cases (Guo et al., ICML 2017)."""
+"""Temperature scaling, after which a score of 0.8 is correct in 80 % of cases (Guo et al., ICML 2017)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from lidar_perception.detectors.pointnet.network import PointNet
 
-STEPS = 60
+MAX_ITERATIONS = 60  # maximum iterations of the optimizer
 
 
 def calibrate(network: PointNet, logits: Tensor, labels: Tensor) -> None:
@@ -27,25 +27,25 @@ def calibrate(network: PointNet, logits: Tensor, labels: Tensor) -> None:
     logits, labels = logits[is_labelled].detach().double().cpu(), labels[is_labelled].cpu()
     log_temperature = torch.zeros(1, dtype=torch.double, requires_grad=True)
     offsets = torch.zeros(logits.shape[1], dtype=torch.double, requires_grad=True)
-    optimizer = torch.optim.LBFGS([log_temperature, offsets], max_iter=STEPS, line_search_fn="strong_wolfe")
+    optimizer = torch.optim.LBFGS([log_temperature, offsets], max_iter=MAX_ITERATIONS, line_search_fn="strong_wolfe")
 
     def compute_loss() -> Tensor:
         optimizer.zero_grad()
-        scaled = logits / log_temperature.clamp(-3, 3).exp() + offsets
-        # Regularization: the offset of a class without examples would go to minus infinity.
-        value = functional.cross_entropy(scaled, labels) + 1e-3 * offsets.square().sum()
-        value.backward()
-        return value
+        calibrated_logits = logits / log_temperature.clamp(-3, 3).exp() + offsets
+        # Without regularization, the offset of a class without examples would go to minus infinity.
+        loss = functional.cross_entropy(calibrated_logits, labels) + 1e-3 * offsets.square().sum()
+        loss.backward()
+        return loss
 
     optimizer.step(compute_loss)
     network.temperature.copy_(log_temperature.detach().clamp(-3, 3).exp())
     network.offsets.copy_(offsets.detach())
 
 
-def calibration_error(probabilities: np.ndarray, labels: np.ndarray, bins: int = 10) -> float:
-    """Return the expected calibration error, computed in bins of equal width.
+def compute_calibration_error(probabilities: np.ndarray, labels: np.ndarray, bins: int = 10) -> float:
+    """Compute the expected calibration error in bins of equal width.
 
-    This is the mean difference between the highest probability and the accuracy, or 0 without examples.
+    This is the mean difference between the highest probability and the accuracy; 0 without examples.
 
     Args:
         probabilities: (B, K).

@@ -1,9 +1,9 @@
 """Configuration of paper C's improved PointNet, its ablations and baselines.
 
-Paper C (Zhang et al., PLOS One 2026, e0348581) defines the parts (Eq. 13 to 19) but gives no layer
-widths; docs/explanation/papers.md lists deviations from its equations. The switches are those of
-its Table 5; PointNet and PointNet++ (SSG) are settings of the same network. A checkpoint contains
-the dataclass as JSON, so weights and architecture cannot get separated.
+Paper C (Zhang et al., PLOS One 2026, e0348581) defines the parts (Eq. 13 to 19) but does not state
+layer widths; docs/explanation/papers.md lists deviations from its equations. The switches are those
+of its Table 5. PointNet and PointNet++ (SSG) are configurations of the same network. Checkpoints
+contain the dataclass as JSON, so weights and architecture cannot get separated.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams, E
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.types import CLASSES, InputError
 
-MAX_POINTS = 4096  # maximum points of a cluster, to bound computing time
+MAX_POINTS = 4096  # maximum number of points per cluster, to bound computing time
 SAMPLINGS, DENSITIES = ("random", "farthest"), ("neighbours", "ball")
 
 
@@ -26,26 +26,27 @@ class PointNetConfig:
 
     Attributes:
         name: name of the variant.
-        classes: classes of its scores, without the background, which comes last.
-        dynamic_threshold, log_point_count: clustering (Eq. 6, 7, 11), see `clustering`.
-        msg: group points at all radii; otherwise, if points are grouped, at the largest radius.
+        classes: classes of the scores, without the background, which is the last score.
+        dynamic_threshold, log_point_count: switches of the clustering (Eq. 6, 7, 11), see
+            `clustering`.
+        msg: group points at all radii; otherwise, if points are grouped, only at the largest one.
         mrg: concatenate features of a coarser grouping and of single points, weighted by density
             (Eq. 15, 17).
         skip: concatenate shallow features with the deep ones (Eq. 16).
-        grouped: group points. If grouped, msg and mrg are all off, points are processed one by one,
-            as in PointNet.
+        grouped: group points. If grouped, msg and mrg are all False, points are processed one by
+            one, as in PointNet.
         points: maximum number of points read from a cluster (Eq. 13).
-        centroids, coarse: numbers of groups of points, and of groups of these centroids.
+        centroids, coarse: number of groups of points, and number of groups of their centroids.
         radii, coarse_radius: radii of the groups, metres.
         neighbours, coarse_neighbours: maximum number of members of a group.
-        sampling: choice of the centroids among the points. random: the first ones. farthest: by
-            farthest point sampling (Eq. 15, 17).
-        density: weight of the features at each radius (Eq. 17). neighbours: members of the group
-            per radius, which are at most `neighbours`. ball: all points within the radius per
-            volume.
+        sampling: selection of centroids among the points. random: the first points, which are in
+            random order. farthest: farthest point sampling (Eq. 15, 17).
+        density: weight of the features at each radius (Eq. 17). neighbours: number of members of
+            the group, at most `neighbours`, divided by the radius. ball: number of all points
+            within the radius divided by the volume.
         point_channels, group_channels, local_channels, global_channels, head_channels: widths of
             the layers.
-        yaw_bins: number of bins of the circle.
+        yaw_bins: number of yaw bins of the full circle.
         sizes: reference length, width and height of each class, metres; by default the means of
             KITTI's training labels (Geiger et al. 2012).
     """
@@ -96,25 +97,25 @@ class PointNetConfig:
             or min(self.coarse_radius, *self.radii) <= 0
             or not (self.point_channels and self.group_channels and self.head_channels)
         ):
-            raise ValueError("every count, width and radius must be above 0")
-        if unknown := [name for name in self.classes if name not in CLASSES]:
-            raise ValueError(f"unknown class {unknown[0]!r}; choose from {', '.join(CLASSES)}")
+            raise ValueError("all counts, widths and radii must be above 0")
+        if unknown_names := [name for name in self.classes if name not in CLASSES]:
+            raise ValueError(f"unknown class {unknown_names[0]!r}; choose from {', '.join(CLASSES)}")
         if not self.classes or len(self.sizes) != len(self.classes):
-            raise ValueError("classes and sizes differ in length")
+            raise ValueError("classes and sizes must have the same length, at least 1")
         if len(set(self.classes)) < len(self.classes) or min(map(min, self.sizes)) <= 0:
-            raise ValueError("a class occurs twice, or has a size of 0")
+            raise ValueError("classes must be unique, and sizes above 0")
         if not self.radii or len(self.radii) != len(self.neighbours):
-            raise ValueError("radii and neighbours differ in length")
+            raise ValueError("radii and neighbours must have the same length, at least 1")
         if list(self.radii) != sorted(self.radii) or max(self.neighbours) > self.points:
-            raise ValueError("radii must be ascending, and neighbours at most points")
+            raise ValueError("radii must be in ascending order, and neighbours at most points")
         if not max(self.coarse, self.coarse_neighbours) <= self.centroids <= self.points:
-            raise ValueError("coarse and coarse_neighbours must be at most centroids, and these at most points")
+            raise ValueError("expected coarse <= centroids, coarse_neighbours <= centroids and centroids <= points")
         if self.sampling not in SAMPLINGS or self.density not in DENSITIES:
             raise ValueError(
                 f"sampling must be one of {', '.join(SAMPLINGS)}, and density one of {', '.join(DENSITIES)}"
             )
         if self.points > MAX_POINTS:
-            raise ValueError(f"points are more than {MAX_POINTS}")
+            raise ValueError(f"points must be at most {MAX_POINTS}")
 
     @property
     def title(self) -> str:
@@ -130,21 +131,21 @@ class PointNetConfig:
         return scales[-1:] if self.grouped or self.mrg else ()
 
     @property
-    def farthest(self) -> int:
-        """Number of points in the order of farthest point sampling, see make_network_input."""
+    def farthest_count(self) -> int:
+        """Number of points selected by farthest point sampling, see make_network_input."""
         return self.centroids if self.sampling == "farthest" else 0
 
     @property
-    def least_points(self) -> int:
-        """Minimum number of points after padding, so that all groups can be filled."""
+    def min_points(self) -> int:
+        """Minimum number of points after padding, as needed to fill all groups."""
         return max(self.coarse, self.coarse_neighbours, *self.neighbours)
 
     @property
     def clustering(self) -> ClusteringParams:
         """Clustering parameters for this network.
 
-        Without dynamic_threshold the distance threshold is the same for all points. Without
-        log_point_count it does not depend on the number of neighbours.
+        Without dynamic_threshold, the distance threshold is the same for all points. Without
+        log_point_count, it does not depend on the number of neighbours.
         """
         euclidean = EuclideanParams(
             threshold="local" if self.dynamic_threshold else "fixed",
@@ -200,13 +201,17 @@ NETWORKS: dict[str, Switches] = {
 
 
 def make_pointnet_config(name: str = "improved", **changes: Any) -> PointNetConfig:
-    """Make the config of a network of NETWORKS, with other fields changed.
+    """Make the config of a network.
+
+    Args:
+        name: key in NETWORKS.
+        changes: values of other fields of PointNetConfig.
 
     Raises:
         InputError: the name is unknown, or the fields do not fit together.
     """
     if name not in NETWORKS:
-        raise InputError(f"there is no network {name!r}; choose one of {', '.join(NETWORKS)}")
+        raise InputError(f"unknown network {name!r}; choose from {', '.join(NETWORKS)}")
     try:
         return replace(PointNetConfig(name=name, **NETWORKS[name]), **changes)
     except (ValueError, TypeError) as error:

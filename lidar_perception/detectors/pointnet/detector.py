@@ -1,4 +1,4 @@
-"""PointNet as a detector: ground and clusters before the network, NMS after it (paper C)."""
+"""PointNet detector: ground segmentation, clustering, network and NMS (paper C)."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorPa
 from lidar_perception.detectors.pointnet.predict import Network, Predictions, select_detections
 from lidar_perception.detectors.weights_file import find_pointnet_weights
 from lidar_perception.runs.threads import set_thread_count
-from lidar_perception.types import InputError, PointCloud
+from lidar_perception.types import EMPTY_CLOUD, Detections, InputError, PointCloud
 
 
 class PointNetDetector(NetworkDetector):
-    """The improved PointNet as a detector, see contract.py. It covers the whole cloud.
+    """The improved PointNet as a detector, see contract.Detector. It covers the whole cloud.
 
-    Ground and clusters are computed if they are None.
+    If a call passes no ground or no clusters, they are computed.
     """
 
     group = "pointnet"
@@ -70,12 +70,12 @@ class PointNetDetector(NetworkDetector):
             cluster_ids = cluster_obstacles(view.frame, ground, self.params.clustering, view.source.xyz)
         t3 = perf_counter()
         clusters = make_clusters(view.frame, cluster_ids, settings.min_points)
-        dropped = max(len(clusters) - settings.max_clusters, 0)
+        ignored_count = max(len(clusters) - settings.max_clusters, 0)
         clusters = clusters.take_nearest(settings.max_clusters).with_ground(view.frame.xyz.compress(ground, axis=0))
-        t4 = self.classifier.now()
+        t4 = self.classifier.get_time()
         predictions = self.classifier.predict(clusters, cpu_fallback=settings.cpu_fallback)
-        t5 = self.classifier.now()
-        detections, best, output_problem = self._make_detections(predictions)
+        t5 = self.classifier.get_time()
+        detections, best_scores, output_problem = self._make_detections(predictions)
         boxes = move_cars_to_points(
             detections.boxes, detections.class_ids, view.frame.xyz.compress(~ground, axis=0), settings.on_points
         )
@@ -84,46 +84,47 @@ class PointNetDetector(NetworkDetector):
         timings = {
             step: seconds * 1e3 for step, seconds in zip(STEPS, (t1 - t0 + t4 - t3, t2 - t1, t3 - t2, t5 - t4, t6 - t5))
         }
-        problem = output_problem or self._find_problem(view, cluster_ids, clusters, dropped)
-        return DetectionResult(detections, timings, problem or self.fallback, best)
+        problem = output_problem or self._find_problem(view, cluster_ids, clusters, ignored_count)
+        return DetectionResult(detections, timings, problem or self.fallback, best_scores)
 
-    def _make_detections(self, predicted: Predictions) -> tuple:
-        """Return the detections, the best scores by class and a problem or None."""
+    def _make_detections(self, predictions: Predictions) -> tuple[Detections, dict[str, float], str | None]:
+        """Return the detections, the best score of each class if there are none, and a problem or None."""
         output_problem = None
-        best: dict[str, float] = {}
-        valid = np.isfinite(np.column_stack([predicted.probabilities, predicted.boxes])).all(axis=1)
-        if not valid.all():
+        best_scores: dict[str, float] = {}
+        is_finite = np.isfinite(np.column_stack([predictions.probabilities, predictions.boxes])).all(axis=1)
+        if not is_finite.all():
             output_problem = (
-                f"the network's outputs are NaN for {len(valid) - valid.sum()} of "
-                f"{len(valid)} clusters; check the weights and the intensity"
+                f"the network's outputs are NaN for {len(is_finite) - is_finite.sum()} of "
+                f"{len(is_finite)} clusters; check the weights and the intensity"
             )
-        predicted = predicted.take(np.flatnonzero(valid))
+        predictions = predictions.take(np.flatnonzero(is_finite))
         detections = calibrate_scores(
             select_detections(
-                predicted, self.classifier.config, self.classifier.to_raw_scores(self.min_scores), self.settings.nms
+                predictions, self.classifier.config, self.classifier.to_raw_scores(self.min_scores), self.settings.nms
             ),
             self.classifier.header.calibration,
         )
-        if len(detections) == 0 and valid.any():
-            highest = predicted.probabilities[:, : len(self.classes)].max(axis=0)
-            best, score_problem = self.classifier.find_best_scores(highest.tolist())
+        if len(detections) == 0 and is_finite.any():
+            class_scores = predictions.probabilities[:, : len(self.classes)].max(axis=0)
+            best_scores, score_problem = self.classifier.find_best_scores(class_scores.tolist())
             output_problem = score_problem or output_problem
-        return detections, best, output_problem
+        return detections, best_scores, output_problem
 
     def _find_problem(
-        self, view: NormalizedView, cluster_ids: np.ndarray, clusters: Clusters, dropped: int
+        self, view: NormalizedView, cluster_ids: np.ndarray, clusters: Clusters, ignored_count: int
     ) -> str | None:
         if len(view.source) == 0:
-            return "the cloud is empty or has no finite point, or crop.* leaves none"
+            return EMPTY_CLOUD
         if not (cluster_ids > 0).any():
             return (
-                "no clusters; check ground.sensor_pose, and clustering.euclidean or clustering.dbscan for this sensor"
+                "no clusters found; check ground.sensor_pose, and adapt clustering.euclidean or clustering.dbscan to "
+                "this sensor"
             )
         if len(clusters) == 0:
-            return f"every cluster has fewer than {self.settings.min_points} points; lower pointnet.min_points"
-        if dropped:
+            return f"all clusters have fewer than {self.settings.min_points} points; lower pointnet.min_points"
+        if ignored_count:
             return (
-                f"the farthest {dropped} of {len(clusters) + dropped} clusters are ignored; "
+                f"the farthest {ignored_count} of {len(clusters) + ignored_count} clusters are ignored; "
                 "raise clustering's min_size or pointnet.max_clusters"
             )
         return view.find_intensity_problem()
@@ -139,11 +140,12 @@ class PointNetDetector(NetworkDetector):
 def load_pointnet_detector(
     path: str | Path = "", device: str = "auto", params: PointNetDetectorParams | None = None
 ) -> PointNetDetector:
-    """Load a detector from a checkpoint.
+    """Load a detector from a checkpoint (.safetensors) or an exported network (.onnx).
 
     Args:
-        path: file of the weights; empty: `params.pointnet.weights`, by default the shipped one.
-        params: None: defaults, with the ground and clustering parameters of the training.
+        path: weights file; empty: `params.pointnet.weights`, by default the shipped file.
+        params: None: defaults with the ground and clustering parameters that the network was
+            trained with.
 
     Raises:
         InputError: the file is missing or not a PointNet, or the device does not exist.
@@ -165,16 +167,18 @@ def load_pointnet_detector(
 
 
 def _load_network(path: Path, device: str, engine: str) -> tuple[Header, Network]:
-    """Load a checkpoint or an exported file; torch is used only if compiled kernels cannot run it."""
+    """Load a checkpoint or an exported network. torch is used only if compiled kernels cannot run it."""
     if path.suffix == ".onnx":
         from lidar_perception.detectors.pointnet.onnx import OnnxPointNet
 
         if device != CPU:
-            raise InputError(f"{path} runs on the CPU only, not on {device!r}; give the checkpoint, or the device cpu")
+            raise InputError(
+                f"{path} runs in ONNX Runtime on the CPU, not on {device!r}; use the checkpoint it was exported from"
+            )
         exported = OnnxPointNet(path)
         return exported.header, exported
     if device == CPU and engine == "auto" and LANES:
-        with suppress(WeightsMismatch):  # the torch path reports what does not fit
+        with suppress(WeightsMismatch):  # load_pointnet() below reports the mismatch
             header, tensors = read_arrays(path, PointNetConfig)
             return header, CompiledPointNet(header.config, tensors)
     from lidar_perception.detectors.pointnet.network import fuse_norms, load_pointnet

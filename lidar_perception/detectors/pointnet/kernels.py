@@ -1,6 +1,6 @@
-"""Compiled kernels of PointNet: grouping of points, and maxima.
+"""Compiled kernels of PointNet: grouping of points, and maxima over groups.
 
-Rows of several clusters or groups are concatenated: cluster k has the rows first[k] to
+The rows of several clusters or groups are concatenated. Cluster k has the rows first[k] to
 first[k + 1], where first is (K + 1,) int64.
 """
 
@@ -13,9 +13,12 @@ from lidar_perception.detectors.matrix_kernel import UNROLL
 
 
 @njit(cache=True, nogil=True)
-def max_by_group(rows, first, columns):
-    """Return the maximum of each group of rows over the first `columns` columns, (K, columns)
-    float32; NaN if a value is NaN or the group is empty."""
+def compute_group_maxima(rows, first, columns):
+    """Compute the maximum of each group of rows in each of the first `columns` columns.
+
+    Returns:
+        (K, columns) float32, NaN if a value is NaN or the group is empty.
+    """
     maxima = np.full((len(first) - 1, columns), np.nan, np.float32)
     for k in range(len(maxima)):
         if first[k] < first[k + 1]:
@@ -29,9 +32,9 @@ def max_by_group(rows, first, columns):
 
 @njit(cache=True, nogil=True)
 def _find_nearest(points, begin, end, centre, count, distances, indices):
-    """Find up to `count` of the points begin to end that are nearest to the point `centre`.
+    """Find up to `count` points among begin to end that are nearest to the point `centre`.
 
-    Writes their squared distances, ascending, and their indices; returns their number.
+    Writes their squared distances, in ascending order, and their indices. Returns their number.
     """
     neighbour_count = 0
     for i in range(begin, end):
@@ -52,7 +55,7 @@ def _find_nearest(points, begin, end, centre, count, distances, indices):
 
 @njit(cache=True, nogil=True)
 def _count_within(points, begin, end, centre, squared_radius):
-    """Count the points begin to end within a radius of the point `centre`."""
+    """Count the points among begin to end that are within a radius of the point `centre`."""
     count = 0
     for i in range(begin, end):
         x = points[centre, 0] - points[i, 0]
@@ -63,19 +66,21 @@ def _count_within(points, begin, end, centre, squared_radius):
 
 
 @njit(cache=True, nogil=True)
-def group_neighbours(points, first, max_centres, radii, counts, in_ball):
-    """Group points (P, 5 or more) around the first `max_centres` points of each cluster.
+def group_neighbours(points, first, max_centres, radii, counts, use_ball_density):
+    """Group points (P, 5 or more) around the first `max_centres` points of each cluster, at S scales.
 
     Args:
-        radii, counts: (S,) float32 and int64, ascending radius and maximum size of the groups of
-            each scale. A group contains the nearest points.
-        in_ball: bool, the density counts all points within the radius.
+        radii: (S,) float32 radius of the groups, in ascending order.
+        counts: (S,) int64 maximum size of the groups. A group contains the nearest points.
+        use_ball_density: True to compute the density from all points within the radius.
 
     Returns:
-        For each scale, relative points (S, R, 8) float32, x y z in units of the radius and two more
-        numbers, padded with zeros; first rows of the groups (S, C + 1); density (C, S) float32, the
-        size of a group relative to counts x radius, or the points in the ball relative to radius
-        cubed; and the first centre of each cluster (K + 1,).
+        relative: (S, R, 8) float32 members of the groups: x y z relative to the centre, in units
+            of the radius, and two more columns of `points`, padded with zeros.
+        starts: (S, C + 1) int64 first row in `relative` of each group.
+        density: (C, S) float32 size of a group divided by counts x radius, or number of points in
+            the ball divided by radius cubed.
+        first_centre: (K + 1,) int64 first centre of each cluster.
     """
     clusters, scales = len(first) - 1, len(radii)
     first_centre = np.zeros(clusters + 1, np.int64)
@@ -99,7 +104,7 @@ def group_neighbours(points, first, max_centres, radii, counts, in_ball):
                             relative[s, row, axis] = (neighbour[axis] - points[centre, axis]) / radius
                         relative[s, row, 3], relative[s, row, 4] = neighbour[3], neighbour[4]
                         row += 1
-                if in_ball:
+                if use_ball_density:
                     points_in_ball = _count_within(points, first[k], first[k + 1], centre, radius * radius)
                     density[c, s] = points_in_ball / (radius * radius * radius)
                 else:
@@ -110,16 +115,15 @@ def group_neighbours(points, first, max_centres, radii, counts, in_ball):
 
 @njit(cache=True, nogil=True)
 def compute_coarse_maxima(points, first, rows, first_row, max_groups, count, radius, weights):
-    """Return the maximum of a linear layer with ReLU over the coarse groups of each cluster, (K, C)
-    float32.
+    """Compute the maximum of a linear layer with ReLU over the coarse groups of each cluster, (K, C) float32.
 
     The centres of a cluster are its first points. A group consists of up to `count` centres within
     `radius` of one of the first `max_groups` centres.
 
     Args:
-        rows, first_row: (R, C) float32, output of the layer for the features of the centres, and
-            (K + 1,) first row of each cluster.
-        weights: (3, C) float32, weights of the relative position.
+        rows: (R, C) float32, output of the layer for the features of the centres.
+        first_row: (K + 1,) first row in `rows` of each cluster.
+        weights: (3, C) float32, weights of the layer for the relative position.
     """
     maxima = np.zeros((len(first) - 1, rows.shape[1]), np.float32)
     distances, indices = np.empty(count, np.float32), np.empty(count, np.int64)

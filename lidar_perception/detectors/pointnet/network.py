@@ -1,15 +1,14 @@
-"""The network of paper C, the improved PointNet (Eq. 13 to 17, see config.py for the options), its
-ablations and baselines.
+"""The improved PointNet of paper C (Eq. 13 to 17), its ablations and baselines; see config.py.
 
     points -> PointMlp --------------------------+-> raw ----------------+
                  +-> LocalNet (MSG, Eq. 14) -> max -> fine --------------+-> head -> class, box
                          +-> CoarseNet (MRG, Eq. 15) -> max -> coarse ---+
-                 shallow features, skipped over (Eq. 16) ----------------+
+                 shallow features by a skip connection (Eq. 16) ---------+
 
-B clusters, N points, M centroids, k neighbours, C channels. A cluster with fewer than N points is
-padded with copies of its points, which do not change a maximum. `valid` is False for copies, which
-are not used as neighbours. Neighbours beyond the radius are replaced by the nearest one, the
-centroid itself.
+B clusters, N points, M centroids, k neighbours, C channels. Clusters with fewer than N points are
+padded with copies of their points, which do not change a maximum. `valid` is False for copies; they
+are not used as neighbours. Neighbours outside the radius are replaced by the nearest one, which is
+the centroid itself.
 """
 
 from __future__ import annotations
@@ -39,58 +38,63 @@ class LinearNormRelu(nn.Sequential):
     def forward(self, x: Tensor) -> Tensor:
         return super().forward(x.reshape(-1, x.shape[-1])).view(*x.shape[:-1], -1)
 
-    def apply_to_groups(self, own: Tensor, features: Tensor, indices: Tensor) -> Tensor:
-        """Apply the layer to own (B, M, k, c) concatenated with rows of features.
+    def apply_to_groups(self, positions: Tensor, features: Tensor, indices: Tensor) -> Tensor:
+        """Apply the layer to the members of groups.
 
-        Each row of features (B, N, C), selected by indices (B, M, k), is multiplied only once even
-        if it belongs to several groups.
+        The input of a member is its position concatenated with a row of features. Each row is
+        multiplied by its weights only once, even if it belongs to several groups.
+
+        Args:
+            positions: (B, M, k, 3) relative positions of the members.
+            features: (B, N, C).
+            indices: (B, M, k) row in `features` of each member.
         """
         linear, norm, relu = self
         assert isinstance(linear, nn.Linear)
-        own_weight, row_weight = linear.weight.split([own.shape[-1], features.shape[-1]], dim=1)
-        x = functional.linear(own, own_weight, linear.bias).add_(
-            gather_rows(functional.linear(features, row_weight), indices)
+        position_weight, feature_weight = linear.weight.split([positions.shape[-1], features.shape[-1]], dim=1)
+        x = functional.linear(positions, position_weight, linear.bias).add_(
+            gather_rows(functional.linear(features, feature_weight), indices)
         )
         return relu(norm(x.flatten(0, 2))).view(x.shape)
 
 
 def make_mlp(*channels: int) -> nn.Sequential:
-    """Make one LinearNormRelu layer from each width to the next."""
+    """Make a multilayer perceptron with these layer widths."""
     return nn.Sequential(*(LinearNormRelu(a, b) for a, b in pairwise(channels)))
 
 
 def compute_squared_distances(centres: Tensor, xyz: Tensor, valid: Tensor) -> Tensor:
     """Return the squared distances (B, M, N) of centres (B, M, 3) to points xyz (B, N, 3).
 
-    The distance to a point that is not valid is inf.
+    Distances to points that are not valid are inf.
     """
-    # Differences instead of a matrix product keep the distance of a point to itself exactly 0.
-    # Separate axes: a sum over an axis of length 3 takes four times as long.
+    # Unlike a matrix product, differences give a distance of exactly 0 from a point to itself. The
+    # axes are added one by one because a sum over an axis of length 3 takes four times as long.
     x, y, z = ((a[:, :, None] - b[:, None]).square() for a, b in zip(centres.unbind(-1), xyz.unbind(-1)))
     return (x + y + z).masked_fill(~valid[:, None], torch.inf)
 
 
 def find_nearest(squared: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the `count` nearest points to each centre by squared distances (B, M, N).
+    """Find the `count` points nearest to each centre, given squared distances (B, M, N).
 
     Returns:
-        Squared distances (B, M, k), ascending, inf if there are fewer than k valid points; and
-        indices (B, M, k).
+        Squared distances (B, M, k), ascending, inf beyond the last valid point; and indices
+        (B, M, k).
     """
     return squared.topk(count, dim=2, largest=False)
 
 
 def gather_rows(values: Tensor, indices: Tensor) -> Tensor:
     """Return the rows (B, M, k, C) of values (B, N, C) at indices (B, M, k)."""
-    first = torch.arange(values.shape[0], device=values.device)[:, None, None] * values.shape[1]
-    rows = values.flatten(0, 1).index_select(0, (indices + first).flatten())
+    offsets = torch.arange(values.shape[0], device=values.device)[:, None, None] * values.shape[1]
+    rows = values.flatten(0, 1).index_select(0, (indices + offsets).flatten())
     return rows.view(*indices.shape, -1)
 
 
 class LocalNet(nn.Module):
-    """Features around each centroid, grouped at each radius and weighted by density (Eq. 14, 17).
+    """Local features: points grouped around each centroid at several radii, weighted by density (Eq. 14, 17).
 
-    One neighbour search serves all radii.
+    All radii share one neighbour search.
     """
 
     def __init__(
@@ -123,7 +127,7 @@ class LocalNet(nn.Module):
 
 
 class CoarseNet(nn.Module):
-    """Features of centroids, grouped around a subset of them (Eq. 15)."""
+    """Coarse features: local features of centroids, grouped around some of the centroids (Eq. 15)."""
 
     def __init__(self, channels: int, out: int, radius: float, neighbours: int):
         super().__init__()
@@ -141,7 +145,7 @@ class CoarseNet(nn.Module):
 
 
 class PointNet(nn.Module):
-    """Network for B clusters; points (B, N, 5), valid (B, N) and context (B, 6) are as in ClusterInput."""
+    """Network for B clusters, with points (B, N, 5), valid (B, N) and context (B, 6) as in ClusterInput."""
 
     temperature: Tensor
     offsets: Tensor
@@ -176,7 +180,7 @@ class PointNet(nn.Module):
         self.head = make_mlp(feature_count + CONTEXT, *config.head_channels)
         self.classes = nn.Linear(config.head_channels[-1], classes + 1)
         self.box = nn.Linear(config.head_channels[-1], 6 + 2 * bins)
-        # Result of the calibration, see predict.compute_probabilities.
+        # Parameters of the calibration, see predict.compute_probabilities.
         self.register_buffer("temperature", torch.ones(1))
         self.register_buffer("offsets", torch.zeros(classes + 1))
 
@@ -184,7 +188,7 @@ class PointNet(nn.Module):
         config = self.config
         features = self.points(points)  # (B, N, C)
         parts, shallow = [], [features.amax(dim=1)]
-        # Grouped features get more weight in dense clusters, single points in sparse ones (Eq. 17).
+        # Grouped features have more weight in dense clusters, single points in sparse ones (Eq. 17).
         density = valid.sum(dim=1, keepdim=True) / config.points  # (B, 1)
         if self.local is not None and self.fine is not None:
             local = self.local(points, features, valid, config.centroids)  # (B, M, C)
@@ -205,13 +209,8 @@ class PointNet(nn.Module):
         return Outputs(self.classes(x), box[:, :3], box[:, 3:6], box[:, 6 : 6 + bins], box[:, 6 + bins :])
 
 
-def make_pointnet(config: PointNetConfig) -> PointNet:
-    """Make a network with random weights, in training mode."""
-    return PointNet(config)
-
-
 def fuse_norms(network: PointNet) -> PointNet:
-    """Return a copy for inference with every batch norm folded into the layer before it."""
+    """Return a copy of a network for inference, with all batch norms folded into the layers before them."""
     network = copy.deepcopy(network).eval()
     for module in network.modules():
         if isinstance(module, LinearNormRelu):
@@ -222,9 +221,9 @@ def fuse_norms(network: PointNet) -> PointNet:
 
 
 def load_pointnet(path: str | Path, expected: PointNetConfig | None = None) -> tuple[Header, PointNet]:
-    """Load a checkpoint: header, and network in float32 on the CPU, in training mode.
+    """Load the header and the network of a checkpoint, in float32, on the CPU and in training mode.
 
     Raises:
         InputError: the file cannot be used, or its config differs from `expected`.
     """
-    return load_checkpoint(path, PointNetConfig, make_pointnet, expected)
+    return load_checkpoint(path, PointNetConfig, PointNet, expected)

@@ -21,11 +21,11 @@ from lidar_perception.detectors.pointnet.network import PointNet, fuse_norms
 from lidar_perception.types import InputError
 
 INPUTS = ("points", "valid", "context")
-EXAMPLES = 4  # number of clusters in the example input
+EXAMPLE_CLUSTERS = 4  # number of clusters in the example input
 
 
 class CalibratedPointNet(nn.Module):
-    """The network with a tuple as output and its calibration applied to the logits."""
+    """The network with calibrated logits and a tuple as output."""
 
     def __init__(self, network: PointNet):
         super().__init__()
@@ -41,16 +41,16 @@ def export_onnx(network: PointNet, header: Header, path: str | Path) -> None:
     """Export a network to ONNX, with its header as metadata.
 
     Inputs are points (K, N, 5) float32, valid (K, N) bool and context (K, 6) float32 as in
-    ClusterInput, with any K and N = config.points.
+    ClusterInput, where N = config.points and K may vary.
 
     Raises:
-        InputError: the packages of the extra [onnx] are not installed.
+        InputError: onnx or onnxscript is not installed.
     """
     count = header.config.points
     inputs = {
-        "points": torch.randn(EXAMPLES, count, POINT),
-        "valid": torch.ones(EXAMPLES, count, dtype=torch.bool),
-        "context": torch.zeros(EXAMPLES, CONTEXT),
+        "points": torch.randn(EXAMPLE_CLUSTERS, count, POINT),
+        "valid": torch.ones(EXAMPLE_CLUSTERS, count, dtype=torch.bool),
+        "context": torch.zeros(EXAMPLE_CLUSTERS, CONTEXT),
     }
     clusters = torch.export.Dim("clusters", min=1)
     write_onnx(
@@ -67,22 +67,22 @@ class OnnxPointNet:
     """An exported network in ONNX Runtime, on the CPU; a predict.Network."""
 
     def __init__(self, path: str | Path):
-        """Open an exported file; raises InputError if it cannot be used, see open_session."""
+        """Open an exported network; raise InputError if it cannot be used, see open_session."""
         self.session, text = open_session(path)
         self.source = str(path)
         self.header = Header.from_json(text, self.source, PointNetConfig)
         self.config: PointNetConfig = self.header.config
         names = ({i.name for i in self.session.get_inputs()}, {o.name for o in self.session.get_outputs()})
         if names != ({*INPUTS}, {*Outputs._fields}):
-            raise InputError(f"{path} has inputs or outputs that do not match its header; export it again")
-        self.temperature = np.ones(1, np.float32)  # 1 because the graph already calibrates
+            raise InputError(f"the inputs or outputs of {path} do not match its header; export it again")
+        self.temperature = np.ones(1, np.float32)  # 1 because the graph already returns calibrated logits
         self.offsets = np.zeros(len(self.config.classes) + 1, np.float32)
 
     def to(self, device: str) -> None:
         """Do nothing: the network stays on the CPU."""
 
     def __call__(self, inputs: ClusterInput) -> Outputs[np.ndarray]:
-        """Return the outputs for one or more clusters."""
+        """Return the outputs for K clusters; K must be at least 1."""
         return Outputs(
             *run_session(self.session, self.source, Outputs._fields, {name: getattr(inputs, name) for name in INPUTS})
         )

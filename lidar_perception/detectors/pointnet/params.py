@@ -1,4 +1,4 @@
-"""Parameters of the detector, the source of ROS parameters, command line options and docs."""
+"""Parameters of PointNet, the source of ROS parameters, command line options and docs."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class PointNetParams(NetworkParams):
     min_points: int = param(3, "Ignore clusters with fewer points.", low=1, high=1_000_000)
     max_clusters: int = param(
         4000,
-        "Maximum number of clusters; the nearest are kept and the "
-        "diagnostics report the rest. A typical scan has a few hundred.",
+        "Maximum number of clusters. The nearest ones are kept, and the "
+        "diagnostics report how many are ignored. A typical scan has a few hundred.",
         low=1,
         high=1_000_000,
     )
@@ -44,7 +44,7 @@ GROUND, CLUSTERING = PointNetConfig().ground, PointNetConfig().clustering
 
 @dataclass(frozen=True)
 class PointNetDetectorParams:
-    """All parameter groups of the detector."""
+    """All parameter groups of PointNet."""
 
     input: InputParams = INPUT
     crop: CropParams = CropParams()

@@ -1,4 +1,4 @@
-"""Inference: from clusters to classes and boxes."""
+"""Inference of PointNet: classes and boxes of clusters."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Network(Protocol):
     offsets: np.ndarray
 
     def to(self, device: str) -> None:
-        """Move to another device if the network can."""
+        """Move the network to another device if it supports this."""
 
     def __call__(self, inputs: ClusterInput) -> Outputs[np.ndarray]:
         """Return the outputs for K clusters; K may be 0."""
@@ -39,9 +39,10 @@ class Predictions:
     """Predictions for K clusters.
 
     Attributes:
-        probabilities: (K, C + 1) float32, calibrated, of the C classes and the background.
-        labels: (K,) int64, the likeliest class except background, or the requested class.
-        boxes: (K, 7) float32, the box for that class, in the frame of the clusters.
+        probabilities: (K, C + 1) float32, calibrated probabilities of the C classes and the
+            background.
+        labels: (K,) int64, the most likely class except background, or the requested class.
+        boxes: (K, 7) float32, the box of an object of this class, in the frame of the clusters.
     """
 
     probabilities: np.ndarray
@@ -53,19 +54,19 @@ class Predictions:
         """Probability of each label, (K,)."""
         return self.probabilities[np.arange(len(self.labels)), self.labels]
 
-    def take(self, chosen: np.ndarray) -> Predictions:
+    def take(self, indices: np.ndarray) -> Predictions:
         """Return the predictions for the clusters at indices (M,)."""
-        return Predictions(self.probabilities[chosen], self.labels[chosen], self.boxes[chosen])
+        return Predictions(self.probabilities[indices], self.labels[indices], self.boxes[indices])
 
 
 def select_detections(
     predictions: Predictions, config: PointNetConfig, min_scores: Sequence[float], nms: NmsParams = NmsParams()
 ) -> Detections:
-    """Apply NMS to the boxes with a score of at least min_scores (C,) of their class."""
-    chosen = np.flatnonzero(predictions.scores >= np.asarray(min_scores)[predictions.labels])
-    chosen = chosen[np.argsort(-predictions.scores[chosen], kind="stable")][: nms.candidates]
+    """Apply NMS to the boxes that reach the minimum score of their class, min_scores (C,)."""
+    indices = np.flatnonzero(predictions.scores >= np.asarray(min_scores)[predictions.labels])
+    indices = indices[np.argsort(-predictions.scores[indices], kind="stable")][: nms.candidates]
     return apply_nms(
-        predictions.boxes[chosen], predictions.scores[chosen], predictions.labels[chosen], config.classes, nms
+        predictions.boxes[indices], predictions.scores[indices], predictions.labels[indices], config.classes, nms
     )
 
 
@@ -73,22 +74,24 @@ def predict(network: Network, clusters: Clusters, seed: int = 0, labels: np.ndar
     """Return the predictions for K clusters; K may be 0.
 
     Args:
-        labels: (K,) int64, class for which each box is predicted; None: the likeliest class.
+        labels: (K,) int64, class for which each box is predicted; None: the most likely class.
     """
-    config, classes = network.config, len(network.config.classes)
+    config, class_count = network.config, len(network.config.classes)
     if len(clusters) == 0:
-        return Predictions(np.zeros((0, classes + 1), np.float32), np.zeros(0, np.int64), np.zeros((0, 7), np.float32))
-    inputs = make_network_input(clusters, config.points, seed, config.farthest)
+        return Predictions(
+            np.zeros((0, class_count + 1), np.float32), np.zeros(0, np.int64), np.zeros((0, 7), np.float32)
+        )
+    inputs = make_network_input(clusters, config.points, seed, config.farthest_count)
     outputs = network(inputs)
-    calibrated = compute_probabilities(outputs.logits, network.temperature, network.offsets)
+    probabilities = compute_probabilities(outputs.logits, network.temperature, network.offsets)
     if labels is None:
-        labels = calibrated[:, :classes].argmax(axis=1)
-    return Predictions(calibrated, labels, decode(outputs, inputs, config, labels))
+        labels = probabilities[:, :class_count].argmax(axis=1)
+    return Predictions(probabilities, labels, decode(outputs, inputs, config, labels))
 
 
 def compute_probabilities(logits: np.ndarray, temperature: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """Compute calibrated probabilities softmax(logits / temperature + offsets), (B, K + 1) float32."""
     with np.errstate(all="ignore"):  # broken weights are reported elsewhere
-        scaled = logits / temperature + offsets
-        exponentials = np.exp(scaled - scaled.max(axis=1, keepdims=True))
+        calibrated_logits = logits / temperature + offsets
+        exponentials = np.exp(calibrated_logits - calibrated_logits.max(axis=1, keepdims=True))
         return exponentials / exponentials.sum(axis=1, keepdims=True)

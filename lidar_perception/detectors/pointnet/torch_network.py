@@ -15,11 +15,11 @@ from lidar_perception.detectors.pointnet.compiled import CompiledPointNet
 from lidar_perception.detectors.pointnet.network import PointNet
 from lidar_perception.runs.threads import set_torch_threads
 
-CHUNK = 256  # clusters per batch, bounds the memory and fits into the cache
+CHUNK = 256  # maximum clusters per batch, which limits memory and fits the cache
 
 
 class TorchPointNet:
-    """A PointNet in eval mode, on its device.
+    """A PointNet in torch, in eval mode.
 
     Args:
         engine: implementation on the CPU: torch, or auto for compiled kernels if the CPU has AVX2.
@@ -46,26 +46,26 @@ class TorchPointNet:
 def run_network(network: PointNet, inputs: ClusterInput, chunk: int = CHUNK) -> Outputs[Tensor]:
     """Return the network's outputs for one or more clusters.
 
-    Clusters of similar size form a batch that is padded to its largest cluster, because most
-    clusters have few points.
+    Most clusters have few points, so clusters of similar size form batches that are padded only to
+    their largest cluster.
     """
-    device, min_size = network.temperature.device, network.config.least_points
+    device, min_size = network.temperature.device, network.config.min_points
     sizes = np.maximum(inputs.valid.sum(axis=1), min_size)
     doublings = np.ceil(np.log2(sizes / min_size))
     order = np.argsort(doublings, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(doublings[order])) + 1)
-    parts = []
+    batch_outputs = []
     for rows in groups:
         width = sizes[rows].max()
         for begin in range(0, len(rows), chunk):
-            part = rows[begin : begin + chunk]
-            parts.append(
+            batch = rows[begin : begin + chunk]
+            batch_outputs.append(
                 network(
                     *(
                         torch.from_numpy(x).to(device)
-                        for x in (inputs.points[part, :width], inputs.valid[part, :width], inputs.context[part])
+                        for x in (inputs.points[batch, :width], inputs.valid[batch, :width], inputs.context[batch])
                     )
                 )
             )
     inverse_order = torch.from_numpy(np.argsort(order)).to(device)
-    return Outputs(*(torch.cat(column)[inverse_order] for column in zip(*parts)))
+    return Outputs(*(torch.cat(column)[inverse_order] for column in zip(*batch_outputs)))

@@ -1,7 +1,7 @@
 """Anchor boxes, and decoding of network outputs relative to them (SECOND, Yan et al. 2018).
 
-Every cell of the head's feature map has one anchor per class and yaw. Yaw is encoded modulo pi;
-a separate bin tells the two directions apart. The inverse is in targets.py.
+Each cell of the head's feature map has one anchor per class and yaw. Yaw is encoded modulo pi, and
+a separate bin distinguishes the two directions. The encoding is in targets.py.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from lidar_perception.detectors.pointpillars.config import NetworkConfig
 
 
 def make_anchors(config: NetworkConfig) -> np.ndarray:
-    """Return all anchors (A, 7) float32 [x y z l w h yaw].
+    """Make all anchors (A, 7) float32 [x y z l w h yaw].
 
-    A = H * W * classes * yaws, in this order, with (H, W) = config.head_grid and rows along y.
+    They are ordered by row, column, class and yaw, where rows are along y; see config.head_grid.
     """
     height, width = config.head_grid
     x, y = (
@@ -31,7 +31,7 @@ def make_anchors(config: NetworkConfig) -> np.ndarray:
     return anchors.reshape(-1, 7)
 
 
-def anchor_classes(config: NetworkConfig) -> np.ndarray:
+def get_anchor_classes(config: NetworkConfig) -> np.ndarray:
     """Return the class of each anchor, (A,) int64 indices into config.classes."""
     height, width = config.head_grid
     return np.tile(np.repeat(np.arange(len(config.anchors)), len(config.yaws)), height * width)
@@ -46,8 +46,8 @@ def _place_centres(low: float, high: float, count: int, placement: str) -> np.nd
 def decode(codes: np.ndarray, bins: np.ndarray, anchors: np.ndarray, offset: float) -> np.ndarray:
     """Decode boxes (N, 7) float32 [x y z l w h yaw], yaw in [-pi, pi).
 
-    The angle in `codes` gives the axis of a box, `bins` the direction along it. Sizes are limited
-    to e^4 times the anchor's.
+    The angle in `codes` gives the axis of a box, and `bins` the direction along it. Sizes are
+    limited to e^4 times those of the anchor.
 
     Args:
         codes: (N, 7) float32.

@@ -1,8 +1,8 @@
 """Configuration of all versions and sizes of EG-PointPillars.
 
 Paper B (Ahn, Kim, Park, CMC 2026, 87(1), 84) compares PointPillars (v0) with four versions guided
-by ground segmentation and clustering. The versions are switches of one dataclass. A checkpoint
-contains the dataclass as JSON, so weights and architecture cannot get separated.
+by ground segmentation and clustering. All versions are configurations of one dataclass. Checkpoints
+contain the dataclass as JSON, so weights and architecture cannot get separated.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ VERSIONS = {  # versions of Table 3 in paper B
     "v4": dict(remove_ground=True, cluster_ids=False, pseudo_map=True, neck="fpn"),
 }
 SIZES = {
-    # Lang et al., CVPR 2019; neck with 2C = 64 channels as in paper B
+    # Widths of Lang et al., CVPR 2019; the neck has 2C = 64 channels as in paper B.
     "full": dict(
         pillar_channels=64,
         map_channels=(16, 32, 64),
@@ -31,7 +31,7 @@ SIZES = {
         deconv_channels=128,
         fpn_channels=64,
     ),
-    # same grid with an eighth of the operations, for two CPU cores
+    # The same grid with an eighth of the operations, for two CPU cores.
     "compact": dict(
         pillar_channels=16,
         map_channels=(8, 8),
@@ -44,7 +44,7 @@ SIZES = {
 
 
 class Range(TypedDict):
-    """Covered area of a network, two fields of NetworkConfig."""
+    """Area that a network covers: two fields of NetworkConfig."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
@@ -52,15 +52,15 @@ class Range(TypedDict):
 
 AHEAD = Range(low=(0.0, -39.68, -3.0), high=(69.12, 39.68, 1.0))  # region in which KITTI has labels
 RANGES = {"ahead": AHEAD, "around": Range(low=(-51.2, -51.2, -3.0), high=(51.2, 51.2, 1.0))}
-# Range of each of the two passes that cover `around` with a network trained on `ahead`: one half plus a
-# margin, so that no object is cut off.
+# Half of `around` plus a margin so that no object is cut off. A network trained for `ahead` covers
+# `around` in two passes with this range.
 HALF = Range(low=(-5.12, -51.2, -3.0), high=(51.2, 51.2, 1.0))
 
 XY_SCALE = 0.02  # scale of x and y in networks trained with this package
 CHOICES = {"neck": ("deconv", "fpn"), "fusion": ("add", "concat"), "anchors_at": ("cells", "ends")}
 NORM_EPS = 1e-3  # epsilon of the batch norms
-CODE, BINS = 7, 2  # numbers per box code, and direction bins (half circles)
-MAX_CELLS = 1 << 22  # maximum cells of a grid, to bound computing time: about 100 m x 100 m at 5 cm
+CODE, BINS = 7, 2  # values per box code, and direction bins (half circles)
+MAX_CELLS = 1 << 22  # maximum number of grid cells, to bound computing time: about 100 m x 100 m at 5 cm
 MAX_LAYERS = 64
 
 
@@ -71,7 +71,7 @@ class AnchorClass:
     Attributes:
         size: length, width, height in metres.
         z: z of the centre in metres, for a sensor at SENSOR_HEIGHT.
-        matched: bird's-eye-view IoU from which an anchor is a positive example in training.
+        matched: minimum bird's-eye-view IoU of an anchor that is a positive example in training.
         unmatched: IoU below which an anchor is background.
     """
 
@@ -82,8 +82,7 @@ class AnchorClass:
     unmatched: float
 
 
-# All anchors stand on the ground.
-ANCHORS = tuple(
+ANCHORS = tuple(  # all anchors stand on the ground
     AnchorClass(
         name, properties.anchor, properties.anchor[2] / 2 - SENSOR_HEIGHT, properties.matched, properties.unmatched
     )
@@ -100,21 +99,21 @@ class NetworkConfig:
         cluster_ids: the cluster id of a point, times id_scale, is a fifth input; 0 for ground and
             noise.
         pseudo_map: the network has a branch for the map of classified clusters.
-        neck: 'deconv' (PointPillars) or 'fpn' (paper B, Eq. 1-8). Both end at the resolution of the
-            first block.
-        fusion: 'add' or 'concat', in the fpn.
+        neck: 'deconv' (PointPillars) or 'fpn' (paper B, Eq. 1-8). The output of both has the
+            resolution of the first block.
+        fusion: fusion of the maps in the fpn, 'add' or 'concat'.
         low, high: corners [x y z] of the range, metres.
-        cell: side of a pillar, metres.
+        cell: side length of a pillar, metres.
         xy_scale: factor of x and y before the first layer. With 1, as in the papers and in imported
             weights, x and y are 50 times larger than the other inputs. A compact network then
             spends most of its few channels on the position of the pillar, which the grid encodes
             anyway.
-        max_points: number of points read per pillar, in the order of the cloud; 0: all. Imported
-            weights need this field and the next two.
+        max_points: maximum number of points read per pillar, in the order of the cloud; 0: all.
+            This field and the next two exist for imported weights.
         zero_row: pillars with fewer than max_points points also have a point with all inputs 0, as
             in code that pads pillars.
-        middle_z: the height above the middle of the range is another input of each point.
-        anchors_at: 'cells' places anchors at the centres of the head's cells, 'ends' spreads them
+        middle_z: the height above the middle of the range is an additional input of each point.
+        anchors_at: 'cells' places anchors at the centres of the head's cells, 'ends' spaces them
             evenly from low to high.
         direction_offset: start of the two heading bins, radians.
     """
@@ -163,31 +162,31 @@ class NetworkConfig:
             or min(min(anchor.size) for anchor in self.anchors) <= 0
             or self.max_points < 0
         ):
-            raise ValueError("every width and stride must be at least 1, and sizes above 0")
+            raise ValueError("all widths and strides must be at least 1, and all sizes above 0")
         if sum(self.block_layers) > MAX_LAYERS:
-            raise ValueError(f"block_layers are more than {MAX_LAYERS} in all")
-        for name, allowed in CHOICES.items():
-            if getattr(self, name) not in allowed:
-                raise ValueError(f"{name} is not one of {', '.join(allowed)}")
+            raise ValueError(f"the sum of block_layers must be at most {MAX_LAYERS}")
+        for name, choices in CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} must be one of {', '.join(choices)}")
         if not (self.cell > 0 and all(a < b for a, b in zip(self.low, self.high))):
-            raise ValueError("cell must be above 0, and low below high")
+            raise ValueError("cell must be above 0, and low must be below high")
         height, width = self.grid
         if height * width > MAX_CELLS:
-            raise ValueError(f"a grid of {width} x {height} cells is more than {MAX_CELLS}")
-        total = math.prod(self.block_strides)
-        if height % total or width % total or height < total or width < total:
+            raise ValueError(f"a grid of {width} x {height} cells has more than {MAX_CELLS} cells")
+        max_stride = math.prod(self.block_strides)
+        if height % max_stride or width % max_stride or height < max_stride or width < max_stride:
             raise ValueError(
-                f"a grid of {width} x {height} cells cannot be divided by {total}, "
+                f"a grid of {width} x {height} cells cannot be divided by {max_stride}, "
                 "the product of block_strides; change low, high or cell"
             )
         if not len(self.block_channels) == len(self.block_layers) == len(self.block_strides):
-            raise ValueError("block_channels, block_layers and block_strides differ in length")
-        if unknown := [name for name in self.classes if name not in CLASSES]:
-            raise ValueError(f"unknown class {unknown[0]!r}; choose from {', '.join(CLASSES)}")
+            raise ValueError("block_channels, block_layers and block_strides must have the same length")
+        if unknown_names := [name for name in self.classes if name not in CLASSES]:
+            raise ValueError(f"unknown class {unknown_names[0]!r}; choose from {', '.join(CLASSES)}")
         if len(set(self.classes)) < len(self.classes):
-            raise ValueError("a class has two anchors")
+            raise ValueError("two anchors have the same class")
         if self.zero_row and not self.max_points:
-            raise ValueError("zero_row needs max_points")
+            raise ValueError("zero_row requires max_points")
 
     @property
     def title(self) -> str:
@@ -200,12 +199,12 @@ class NetworkConfig:
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Size (H, W): numbers of cells along y and along x."""
+        """Number of cells along y and along x, (H, W)."""
         return (round((self.high[1] - self.low[1]) / self.cell), round((self.high[0] - self.low[0]) / self.cell))
 
     @property
     def head_grid(self) -> tuple[int, int]:
-        """Size (H, W) of the feature map that the head reads."""
+        """Size (H, W) of the head's input."""
         stride = self.block_strides[0]
         return self.grid[0] // stride, self.grid[1] // stride
 
@@ -230,20 +229,20 @@ def make_config(
     """Make the config of a version and size.
 
     Args:
-        classes: names of classes with an anchor.
-        changes: other fields of NetworkConfig.
+        classes: names of the classes to detect.
+        changes: values of other fields of NetworkConfig.
 
     Raises:
         InputError: a name is unknown, or the fields do not fit together.
     """
-    for name, choices in (version, VERSIONS), (size, SIZES):
+    for kind, name, choices in ("version", version, VERSIONS), ("size", size, SIZES):
         if name not in choices:
-            raise InputError(f"there is no {name!r}; choose one of {', '.join(choices)}")
+            raise InputError(f"unknown {kind} {name!r}; choose from {', '.join(choices)}")
     anchors = {anchor.name: anchor for anchor in ANCHORS}
-    if not classes or (unknown := [name for name in classes if name not in anchors]):
-        raise InputError(
-            f"there is no anchor for {unknown[0] if classes else 'no class'}; choose some of {', '.join(anchors)}"
-        )
+    if not classes:
+        raise InputError(f"no class is given; choose from {', '.join(anchors)}")
+    if unknown_names := [name for name in classes if name not in anchors]:
+        raise InputError(f"no anchor for class {unknown_names[0]!r}; choose from {', '.join(anchors)}")
     settings = dict(
         version=version,
         size=size,

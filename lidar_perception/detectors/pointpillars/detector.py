@@ -1,4 +1,4 @@
-"""EG-PointPillars as a detector: the experts, then the network (paper B)."""
+"""EG-PointPillars detector: ground and cluster experts, followed by the network (paper B)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from lidar_perception.detectors.base import NetworkDetector, make_synthetic_frame
 from lidar_perception.detectors.checkpoint import Header, read_arrays, read_header
 from lidar_perception.detectors.contract import DetectionResult
-from lidar_perception.detectors.devices import CPU, find_device, uses_16_bits
+from lidar_perception.detectors.devices import CPU, find_device, uses_bf16_on_cpu
 from lidar_perception.detectors.layer_weights import WeightsMismatch, to_arrays
 from lidar_perception.detectors.nms import rotated_nms
 from lidar_perception.detectors.normalized_view import NormalizedView, restore_detections
@@ -21,16 +21,16 @@ from lidar_perception.detectors.pointpillars.expert import run_experts
 from lidar_perception.detectors.pointpillars.params import STEPS, DetectorParams, PointPillarsParams
 from lidar_perception.detectors.pointpillars.prediction import Network
 from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
-from lidar_perception.detectors.pointpillars.sparse import SparseNetwork, find_unsupported_part
+from lidar_perception.detectors.pointpillars.sparse import SparseNetwork, find_unsupported_feature
 from lidar_perception.detectors.weights_file import find_pointpillars_weights
 from lidar_perception.runs.threads import set_thread_count
 from lidar_perception.types import InputError, PointCloud
 
 
 class PointPillarsDetector(NetworkDetector):
-    """EG-PointPillars of any version as a detector, see contract.py.
+    """EG-PointPillars of any version as a detector, see contract.Detector.
 
-    Ground and clusters are computed if they are None and the version needs them.
+    If a call passes no ground or no clusters, they are computed if the version needs them.
     """
 
     group = "pointpillars"
@@ -95,10 +95,10 @@ def load_detector(
     """Load a detector from a checkpoint (.safetensors) or an exported network (.onnx).
 
     Args:
-        path: file of the weights; empty: `params.pointpillars.weights`, by default the shipped one.
+        path: weights file; empty: `params.pointpillars.weights`, by default the shipped file.
 
     Raises:
-        InputError: the file is missing or not of the version and size in `params`, the device does
+        InputError: the file is missing, its version or size differs from `params`, the device does
             not exist, or the engine cannot run the network.
     """
     path = Path(path) if str(path) not in ("", ".") else find_pointpillars_weights(params.pointpillars)
@@ -116,7 +116,7 @@ def load_detector(
             )
         if params.pointpillars.amp == "bf16":
             raise InputError(
-                f"{path} works in the numbers it was exported with; set amp: off, or "
+                f"{path} uses the number format it was exported with; set amp: off, or "
                 "use the checkpoint it was exported from"
             )
         if params.pointpillars.engine != "auto":
@@ -132,7 +132,7 @@ def load_detector(
         expected, actual = getattr(params.pointpillars, name), getattr(header.config, name)
         if expected not in ("auto", actual):
             raise InputError(
-                f"{path} has the {name} {actual}, not {expected}; change pointpillars.{name} or pointpillars.weights"
+                f"{path} has {name} {actual}, not {expected}; change pointpillars.{name} or pointpillars.weights"
             )
     proposer = PointPillarsProposer(network, header).with_range(params.pointpillars.range)
     proposer.move(target, params.pointpillars.cpu_fallback)
@@ -143,15 +143,15 @@ def load_detector(
 
 
 def _load_network(path: Path, device: str, params: PointPillarsParams) -> tuple[Header, Network]:
-    """Load the network of a checkpoint; torch is used only if the sparse engine cannot run it."""
+    """Load the network of a checkpoint. torch is used only if the sparse engine cannot run it."""
     if device == CPU and params.engine != "torch":
-        reason = find_unsupported_part(read_header(path, NetworkConfig).config)
-        if not reason and uses_16_bits(params.amp):
+        reason = find_unsupported_feature(read_header(path, NetworkConfig).config)
+        if not reason and uses_bf16_on_cpu(params.amp):
             reason = "it supports float32 only, and amp selects 16 bits"
         if not reason:
             return _load_sparse(path)
         if params.engine == "sparse":
-            raise InputError(f"the sparse engine cannot run this network: {reason}; choose the engine auto or torch")
+            raise InputError(f"the sparse engine cannot run this network: {reason}; set engine: auto or torch")
     from lidar_perception.detectors.pointpillars.network import load_network
     from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 

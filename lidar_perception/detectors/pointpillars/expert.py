@@ -1,7 +1,7 @@
-"""Expert knowledge as network inputs (paper B, Section 3): ground, clusters, and a cluster map.
+"""Expert knowledge as network input (paper B, Section 3): ground, clusters and a cluster map.
 
-The experts process only points in the range of the network. Columns from earlier stages, such as
-the nodes ground_segmentation and clustering, are used unchanged.
+The experts process only the points in the network's range. Ground and clusters from earlier
+stages, such as the nodes ground_segmentation and clustering, are used unchanged.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from lidar_perception.ground.params import GroundParams
 from lidar_perception.groups import renumber_ids
 from lidar_perception.types import PointCloud
 
-MAP_KINDS = ("vehicle", "cyclist", "pedestrian")  # channels of the map, the same for every set of classes
-# Class -> index into MAP_KINDS; the last entry, -1, is for clusters without a class.
+MAP_KINDS = ("vehicle", "cyclist", "pedestrian")  # channels of the cluster map, the same for all networks
+# Index into MAP_KINDS by class id; the last entry, -1, is for clusters without a class.
 CHANNELS = np.array([*(MAP_KINDS.index(row.motion_model) for row in TABLE), -1])
 
 
@@ -52,8 +52,8 @@ def make_network_input(
 
     Args:
         ground: (N,) bool; None: computed if the version needs it.
-        cluster_ids: (N,) int, 0 for no cluster; None: computed if the version needs it. The network
-            gets consecutive ids from 1, in the same order.
+        cluster_ids: (N,) int, 0 for no cluster; None: computed if the version needs it. For the
+            network, the ids are renumbered from 1 in the same order.
     """
     ground, cluster_ids = run_experts(view, config, ground, cluster_ids, ground_params, clustering)
     if config.remove_ground:
@@ -82,16 +82,16 @@ def run_experts(
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Return ground (N,) bool and cluster ids (N,) int of the N points of a NormalizedView.
 
-    They are computed if they are None and the version needs them. The ids are None if the version
-    does not use clusters.
+    They are computed if they are None and the version needs them. The cluster ids are None if the
+    version does not use clusters.
     """
-    needs_clusters = config.cluster_ids or config.pseudo_map
-    if not needs_clusters:
+    uses_clusters = config.cluster_ids or config.pseudo_map
+    if not uses_clusters:
         cluster_ids = None
-    missing = needs_clusters and cluster_ids is None
-    if ground is None and (config.remove_ground or missing):
+    is_missing = uses_clusters and cluster_ids is None
+    if ground is None and (config.remove_ground or is_missing):
         ground = segment_view_ground(view, ground_params)
-    if missing:
+    if is_missing:
         assert ground is not None
         cluster_ids = cluster_obstacles(view.xyz, ground, clustering)
     return ground, cluster_ids
@@ -101,8 +101,8 @@ def draw_clusters(xyz: np.ndarray, cluster_ids: np.ndarray, config: NetworkConfi
     """Draw the 2D pseudo-map of clusters (paper B, Section 3.1.2).
 
     Clusters are classified by the diagonal of their minimum-area rectangle and drawn as filled
-    ellipses into the channel of their kind. An ellipse fills the cells whose centres are inside it,
-    and the cell that contains the centre of the ellipse.
+    ellipses into the channel of their kind. An ellipse covers the cells whose centres are inside
+    it, and the cell that contains its own centre.
 
     Args:
         xyz: (N, 3) points with cluster ids (N,), 1..K.
@@ -117,28 +117,28 @@ def draw_clusters(xyz: np.ndarray, cluster_ids: np.ndarray, config: NetworkConfi
 
 
 @njit(cache=True, nogil=True)
-def _fill_ellipses(image, shapes, channels, low_x, low_y, cell):
+def _fill_ellipses(image, ellipses, channels, low_x, low_y, cell_size):
     _, height, width = image.shape
-    for k in range(len(shapes)):
+    for k in range(len(ellipses)):
         if channels[k] < 0:
             continue
-        x, y, a, b, yaw = shapes[k]
+        x, y, a, b, yaw = ellipses[k]
         channel = image[channels[k]]
-        row, column = int(np.floor((y - low_y) / cell)), int(np.floor((x - low_x) / cell))
+        row, column = int(np.floor((y - low_y) / cell_size)), int(np.floor((x - low_x) / cell_size))
         if 0 <= row < height and 0 <= column < width:
             channel[row, column] = 1
         if b <= 0.0:
             continue
         cos, sin = np.cos(yaw), np.sin(yaw)
-        reach_x, reach_y = np.hypot(a * cos, b * sin), np.hypot(a * sin, b * cos)
-        first_row = max(int(np.floor((y - reach_y - low_y) / cell)), 0)
-        last_row = min(int(np.floor((y + reach_y - low_y) / cell)), height - 1)
-        first_column = max(int(np.floor((x - reach_x - low_x) / cell)), 0)
-        last_column = min(int(np.floor((x + reach_x - low_x) / cell)), width - 1)
+        extent_x, extent_y = np.hypot(a * cos, b * sin), np.hypot(a * sin, b * cos)
+        first_row = max(int(np.floor((y - extent_y - low_y) / cell_size)), 0)
+        last_row = min(int(np.floor((y + extent_y - low_y) / cell_size)), height - 1)
+        first_column = max(int(np.floor((x - extent_x - low_x) / cell_size)), 0)
+        last_column = min(int(np.floor((x + extent_x - low_x) / cell_size)), width - 1)
         for i in range(first_row, last_row + 1):
-            dy = low_y + (i + 0.5) * cell - y
+            dy = low_y + (i + 0.5) * cell_size - y
             for j in range(first_column, last_column + 1):
-                dx = low_x + (j + 0.5) * cell - x
+                dx = low_x + (j + 0.5) * cell_size - x
                 u, v = (cos * dx + sin * dy) / a, (cos * dy - sin * dx) / b
                 if u * u + v * v <= 1.0:
                     channel[i, j] = 1

@@ -12,8 +12,8 @@ from lidar_perception.detectors.pointpillars.network import Outputs
 from lidar_perception.detectors.pointpillars.targets import IGNORED, Targets
 
 CLASS_WEIGHT, BOX_WEIGHT, DIRECTION_WEIGHT = 1.0, 2.0, 0.2
-ALPHA, GAMMA = 0.25, 2.0
-SMOOTH = 1 / 9  # the box loss is linear above this error
+ALPHA, GAMMA = 0.25, 2.0  # parameters of the focal loss
+SMOOTH_L1_BETA = 1 / 9  # error above which the box loss is linear
 
 
 class Losses(NamedTuple):
@@ -25,45 +25,44 @@ class Losses(NamedTuple):
     directions: Tensor
 
 
-def detection_loss(outputs: Outputs, targets: Targets, classes_of: Tensor) -> Losses:
+def compute_detection_loss(outputs: Outputs, targets: Targets, anchor_classes: Tensor) -> Losses:
     """Compute the losses of B clouds.
 
     The focal loss of each class is divided by its number of positive anchors, then averaged over
-    the classes. The losses of boxes and directions are means over all positive anchors. At least one
-    anchor per cloud is counted.
+    the classes. The losses of boxes and directions are divided by the number of all positive
+    anchors. These numbers are at least B.
 
     All classes therefore have the same weight. Lang et al. divide by the number of positive anchors
-    of all classes, but a car has ten times as many as a pedestrian.
+    of all classes, but a car has ten times as many of them as a pedestrian.
 
     Args:
-        classes_of: (A,) class of each anchor, see anchors.anchor_classes.
+        anchor_classes: (A,) class of each anchor, see anchors.get_anchor_classes.
     """
-    positive = targets.labels >= 0  # (B, A)
+    is_positive = targets.labels >= 0  # (B, A)
     logits = outputs.logits.float()
-    clouds, _, classes = logits.shape
-    count = logits.new_zeros(classes).index_add_(0, classes_of, positive.sum(dim=0).to(logits))
-    anchor_weights = (count.clamp(min=clouds) * classes).reciprocal()[classes_of]  # (A,)
-    one_hot = functional.one_hot(targets.labels.clamp(min=0), classes).to(logits.dtype)
-    focal = focal_loss(logits, one_hot * positive[..., None]).sum(dim=2)  # (B, A)
-    scores = ((focal * (targets.labels != IGNORED)).sum(dim=0) * anchor_weights).sum()
-    positive_count = count.sum().clamp(min=clouds)
-    codes, bins = targets.codes[positive], targets.bins[positive]  # (P, 7), (P,)
-    predicted = outputs.codes.float()[positive]
-    # sin(a - b) ignores rotations by 180 degrees, which the direction loss handles
-    difference = torch.cat([predicted[:, :6] - codes[:, :6], torch.sin(predicted[:, 6:] - codes[:, 6:])], dim=1)
-    boxes = (
-        functional.smooth_l1_loss(difference, torch.zeros_like(difference), beta=SMOOTH, reduction="sum")
-        / positive_count
+    cloud_count, _, class_count = logits.shape
+    counts = logits.new_zeros(class_count).index_add_(0, anchor_classes, is_positive.sum(dim=0).to(logits))
+    anchor_weights = (counts.clamp(min=cloud_count) * class_count).reciprocal()[anchor_classes]  # (A,)
+    one_hot = functional.one_hot(targets.labels.clamp(min=0), class_count).to(logits.dtype)
+    focal_loss = compute_focal_loss(logits, one_hot * is_positive[..., None]).sum(dim=2)  # (B, A)
+    class_loss = ((focal_loss * (targets.labels != IGNORED)).sum(dim=0) * anchor_weights).sum()
+    positive_count = counts.sum().clamp(min=cloud_count)
+    target_codes, target_bins = targets.codes[is_positive], targets.bins[is_positive]  # (P, 7), (P,)
+    codes, directions = outputs.codes.float()[is_positive], outputs.directions.float()[is_positive]
+    # sin(a - b) ignores rotations by 180 degrees, which the direction loss covers.
+    error = torch.cat([codes[:, :6] - target_codes[:, :6], torch.sin(codes[:, 6:] - target_codes[:, 6:])], dim=1)
+    box_loss = (
+        functional.smooth_l1_loss(error, torch.zeros_like(error), beta=SMOOTH_L1_BETA, reduction="sum") / positive_count
     )
-    headings = functional.cross_entropy(outputs.directions.float()[positive], bins, reduction="sum") / positive_count
-    total = CLASS_WEIGHT * scores + BOX_WEIGHT * boxes + DIRECTION_WEIGHT * headings
-    return Losses(total, scores, boxes, headings)
+    direction_loss = functional.cross_entropy(directions, target_bins, reduction="sum") / positive_count
+    total = CLASS_WEIGHT * class_loss + BOX_WEIGHT * box_loss + DIRECTION_WEIGHT * direction_loss
+    return Losses(total, class_loss, box_loss, direction_loss)
 
 
-def focal_loss(logits: Tensor, targets: Tensor) -> Tensor:
-    """Return the elementwise focal loss; `targets` is 0 or 1."""
+def compute_focal_loss(logits: Tensor, targets: Tensor) -> Tensor:
+    """Compute the elementwise focal loss for targets that are 0 or 1."""
     entropy = functional.binary_cross_entropy_with_logits(logits, targets, reduction="none")
-    score = torch.sigmoid(logits)
-    miss = targets * (1 - score) + (1 - targets) * score
-    weight = targets * ALPHA + (1 - targets) * (1 - ALPHA)
-    return weight * miss**GAMMA * entropy
+    scores = torch.sigmoid(logits)
+    errors = targets * (1 - scores) + (1 - targets) * scores
+    weights = targets * ALPHA + (1 - targets) * (1 - ALPHA)
+    return weights * errors**GAMMA * entropy

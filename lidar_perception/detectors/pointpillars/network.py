@@ -1,10 +1,10 @@
 """The network of PointPillars (Lang et al., CVPR 2019) and EG-PointPillars (paper B).
 
     points -> PillarNet -> pseudo-image --+-> blocks -> neck -> head -> scores, codes, directions
-    map of clusters -> MapNet (V4) -------+
+    cluster map -> MapNet (V4) -----------+
 
-B clouds, N points, H x W pillars, C channels, K classes, A anchors. Images are channels-last in
-memory. Targets, losses and decoding are in targets.py, losses.py and anchors.py.
+B clouds, N points, H x W pillars, C channels, K classes, A anchors. Images are stored channels-last.
+Targets, losses and decoding are in targets.py, losses.py and anchors.py.
 """
 
 from __future__ import annotations
@@ -25,13 +25,19 @@ from lidar_perception.detectors.pointpillars.config import BINS, CODE, NORM_EPS,
 from lidar_perception.detectors.pointpillars.pillars import Pillars
 
 MOMENTUM = 0.01  # momentum of the batch norms
-PRIOR = 0.01  # initial score of every anchor
+PRIOR = 0.01  # initial score of all anchors
 
 Conv = nn.Conv2d | nn.ConvTranspose2d
 
 
 class Outputs(NamedTuple):
-    """logits (B, A, K), codes (B, A, 7), directions (B, A, 2); anchors as in make_anchors."""
+    """Outputs of the network for B clouds, with anchors as in make_anchors.
+
+    Attributes:
+        logits: (B, A, K).
+        codes: (B, A, 7).
+        directions: (B, A, 2).
+    """
 
     logits: Tensor
     codes: Tensor
@@ -51,7 +57,7 @@ def conv3x3(channels: int, out: int, stride: int = 1) -> ConvNormRelu:
 
 
 class PillarNet(nn.Module):
-    """Linear layer on each point, then the maximum per pillar, written into its cell."""
+    """Pseudo-image of pillars: a linear layer for each point, and the maximum over each pillar."""
 
     def __init__(self, config: NetworkConfig):
         super().__init__()
@@ -62,7 +68,7 @@ class PillarNet(nn.Module):
     @torch.autocast("cuda", enabled=False)
     @torch.autocast("cpu", enabled=False)  # 16 bits would round x = 60 m to 25 cm
     def forward(self, pillars: Pillars[Tensor]) -> Tensor:
-        # Cluster ids come last, so that versions with and without them share the first inputs.
+        # Cluster ids come last, so that the first inputs are the same with and without them.
         points = pillars.points
         inputs = torch.cat(
             [
@@ -88,7 +94,7 @@ class PillarNet(nn.Module):
 
         Args:
             image: (B * H * W, C) zeros.
-            inputs: (1, inputs of the layer), a template for shape and dtype.
+            inputs: (1, inputs of the layer), which gives the shape and dtype of the zero point.
         """
         ones = torch.ones_like(cells, dtype=image.dtype)
         sizes = image.new_zeros(len(image)).scatter_add(0, cells, ones)
@@ -109,8 +115,7 @@ class MapNet(nn.Sequential):
 
 
 class DeconvNeck(nn.Module):
-    """Neck of PointPillars: upsample the map of every block to the first one's size and
-    concatenate them."""
+    """Neck of PointPillars: upsample the maps of all blocks to the size of the first and concatenate them."""
 
     def __init__(self, channels: Sequence[int], strides: Sequence[int], out: int):
         super().__init__()
@@ -125,8 +130,11 @@ class DeconvNeck(nn.Module):
 
 
 class FpnNeck(nn.Module):
-    """Neck of V1 to V4 (paper B, Eq. 1 to 8): starting from the coarsest map, upsample bilinearly
-    and fuse with the next finer map."""
+    """Neck of V1 to V4 (paper B, Eq. 1 to 8).
+
+    Starting from the coarsest map, each map is upsampled bilinearly and fused with the next finer
+    map.
+    """
 
     def __init__(self, channels: Sequence[int], strides: Sequence[int], out: int, fusion: str):
         super().__init__()
@@ -147,18 +155,22 @@ class FpnNeck(nn.Module):
 class Head(nn.Module):
     """Single-shot head: one 1 x 1 convolution each for class, box and heading.
 
-    A detector evaluates scores at all anchors, and boxes only at the few with a high score.
+    Detectors compute scores for all anchors, but boxes only for the few with a high score.
+
+    Args:
+        per_cell: number of anchors per cell.
+        classes: number of classes.
     """
 
     def __init__(self, channels: int, per_cell: int, classes: int):
         super().__init__()
-        self.per_cell, self.classes = per_cell, classes  # number of anchors per cell, and of classes
+        self.per_cell, self.classes = per_cell, classes
         self.scores = nn.Conv2d(channels, per_cell * classes, 1)
         self.codes = nn.Conv2d(channels, per_cell * CODE, 1)
         self.directions = nn.Conv2d(channels, per_cell * BINS, 1)
         nn.init.constant_(_get_bias(self.scores), -math.log((1 - PRIOR) / PRIOR))
         for layer, std in ((self.scores, 0.01), (self.codes, 0.001)):
-            if not layer.weight.is_meta:  # on meta, normal_ would import torch's compiler (2 s)
+            if not layer.weight.is_meta:  # on the meta device, normal_ would import torch's compiler (2 s)
                 nn.init.normal_(layer.weight, std=std)
 
     def forward(self, features: Tensor) -> Outputs:
@@ -168,18 +180,18 @@ class Head(nn.Module):
             _reshape_by_anchor(self.directions(features), BINS),
         )
 
-    def logits(self, features: Tensor) -> Tensor:
-        """Return the logits (B, A, K) of forward."""
+    def compute_logits(self, features: Tensor) -> Tensor:
+        """Compute only the logits (B, A, K) of forward()."""
         return _reshape_by_anchor(self.scores(features), self.classes)
 
-    def boxes_at(self, features: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
-        """Return codes (M, 7) and directions (M, 2) at anchors (M,) of a single cloud."""
+    def compute_boxes(self, features: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute codes (M, 7) and directions (M, 2) of the anchors with indices (M,) of a single cloud."""
         rows = features[0].flatten(1)[:, anchors // self.per_cell].T  # (M, C)
-        numbers = anchors % self.per_cell  # index of each anchor within its cell
+        slots = anchors % self.per_cell  # index of each anchor within its cell
 
         def apply(conv: nn.Conv2d, width: int) -> Tensor:
-            weight = conv.weight.view(self.per_cell, width, -1)[numbers]  # (M, width, C)
-            bias = _get_bias(conv).view(self.per_cell, width)[numbers]
+            weight = conv.weight.view(self.per_cell, width, -1)[slots]  # (M, width, C)
+            bias = _get_bias(conv).view(self.per_cell, width)[slots]
             return torch.baddbmm(bias[:, :, None], weight, rows[:, :, None])[:, :, 0]
 
         return apply(self.codes, CODE), apply(self.directions, BINS)
@@ -191,12 +203,12 @@ def _get_bias(conv: nn.Conv2d) -> Tensor:
 
 
 def _reshape_by_anchor(x: Tensor, width: int) -> Tensor:
-    """Reshape (B, P * width, H, W), with P anchors per cell, to (B, H * W * P, width)."""
+    """Reshape (B, P * width, H, W) to (B, H * W * P, width), where P is the number of anchors per cell."""
     return x.permute(0, 2, 3, 1).reshape(len(x), -1, width)
 
 
 class PointPillars(nn.Module):
-    """The complete network; make_network builds its parts from a config."""
+    """The complete network. make_network() makes its parts from a config."""
 
     def __init__(
         self,
@@ -210,11 +222,11 @@ class PointPillars(nn.Module):
         self.pillar_net, self.map_net = pillar_net, map_net
         self.blocks, self.neck, self.head = nn.ModuleList(blocks), neck, head
 
-    def features(self, pillars: Pillars[Tensor], maps: Tensor | None = None) -> Tensor:
-        """Return the input of the head, (B, neck.channels, H/2, W/2).
+    def compute_features(self, pillars: Pillars[Tensor], maps: Tensor | None = None) -> Tensor:
+        """Compute the input of the head, (B, neck.channels, H/2, W/2).
 
         Args:
-            maps: (B, 3, H, W) uint8, required for V4 only.
+            maps: (B, 3, H, W) uint8 cluster maps, for V4 only.
         """
         x = self.pillar_net(pillars)  # (B, C, H, W)
         if self.map_net is not None:
@@ -226,7 +238,7 @@ class PointPillars(nn.Module):
         return self.neck(levels)
 
     def forward(self, pillars: Pillars[Tensor], maps: Tensor | None = None) -> Outputs:
-        return self.head(self.features(pillars, maps))
+        return self.head(self.compute_features(pillars, maps))
 
 
 def make_network(config: NetworkConfig) -> PointPillars:
@@ -243,16 +255,16 @@ def make_network(config: NetworkConfig) -> PointPillars:
         else FpnNeck(config.block_channels, config.block_strides, config.fpn_channels, config.fusion)
     )
     head = Head(neck.channels, config.anchors_per_cell, len(config.anchors))
-    return channels_last(PointPillars(PillarNet(config), map_net, blocks, neck, head))
+    return to_channels_last(PointPillars(PillarNet(config), map_net, blocks, neck, head))
 
 
-def channels_last(network: Net) -> Net:
-    """Convert the weights of a network, in place, to the memory format of its images."""
-    return cast(Any, network).to(memory_format=torch.channels_last)  # missing in torch's stubs
+def to_channels_last(network: Net) -> Net:
+    """Convert the weights of a network in place to the channels-last memory format."""
+    return cast(Any, network).to(memory_format=torch.channels_last)  # not in torch's type stubs
 
 
 def fuse_norms(network: PointPillars) -> PointPillars:
-    """Return a copy for inference with every batch norm folded into the layer before it."""
+    """Return a copy of a network for inference, with all batch norms folded into the layers before them."""
     network = copy.deepcopy(network).eval()
     for module in network.modules():
         if isinstance(module, ConvNormRelu):
@@ -263,11 +275,11 @@ def fuse_norms(network: PointPillars) -> PointPillars:
     net = network.pillar_net
     if isinstance(net.norm, nn.BatchNorm1d):
         net.linear, net.norm = fuse_linear_bn_eval(net.linear, net.norm), nn.Identity()
-    return channels_last(network)
+    return to_channels_last(network)
 
 
 def load_network(path: str | Path, expected: NetworkConfig | None = None) -> tuple[Header, PointPillars]:
-    """Load a checkpoint: header, and network in float32 on the CPU, in training mode.
+    """Load the header and the network of a checkpoint, in float32, on the CPU and in training mode.
 
     Raises:
         InputError: the file cannot be used, or its config differs from `expected`.

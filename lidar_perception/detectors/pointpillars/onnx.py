@@ -1,8 +1,8 @@
-"""ONNX export, and inference with ONNX Runtime.
+"""ONNX export of PointPillars, and inference with ONNX Runtime.
 
-The inputs of the graph are points that are already assigned to pillars; the outputs are those of
-the head. Pillars and boxes are computed outside the graph. It needs ScatterElements with reduction
-max (opset 18), which not every runtime has.
+The inputs of the graph are points that are already assigned to pillars; its outputs are those of
+the head. Pillars and boxes are computed outside the graph. The graph uses ScatterElements with
+reduction max (opset 18), which some runtimes do not support.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from lidar_perception.detectors.pointpillars.pillars import Pillars
 from lidar_perception.detectors.pointpillars.prediction import Prediction
 from lidar_perception.types import InputError
 
-COUNT = 100  # number of points in the example input
+EXAMPLE_POINTS = 100  # number of points in the example input
 OUTPUTS = ["logits", "codes", "directions"]
 
 
-class OneCloud(nn.Module):
-    """The network for one cloud, with tensors as inputs and outputs."""
+class SingleCloudNetwork(nn.Module):
+    """The network for a single cloud, with tensors as inputs and outputs."""
 
     def __init__(self, network: PointPillars, grid: tuple[int, int]):
         super().__init__()
@@ -41,11 +41,11 @@ class OneCloud(nn.Module):
 
 
 def _describe_inputs(config: NetworkConfig) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Return the type and shape of each input for COUNT points."""
+    """Return the type and shape of each input for EXAMPLE_POINTS points."""
     inputs: dict[str, tuple[str, tuple[int, ...]]] = {
-        "points": ("float", (COUNT, config.point_columns)),
-        "offsets": ("float", (COUNT, config.offset_columns)),
-        "cells": ("int64", (COUNT,)),
+        "points": ("float", (EXAMPLE_POINTS, config.point_columns)),
+        "offsets": ("float", (EXAMPLE_POINTS, config.offset_columns)),
+        "cells": ("int64", (EXAMPLE_POINTS,)),
     }
     if config.pseudo_map:
         inputs["cluster_map"] = ("uint8", (1, 3, *config.grid))
@@ -53,24 +53,25 @@ def _describe_inputs(config: NetworkConfig) -> dict[str, tuple[str, tuple[int, .
 
 
 def export_onnx(network: PointPillars, header: Header, path: str | Path) -> None:
-    """Export a network for one cloud to ONNX, with its header as metadata.
+    """Export a network for single clouds to ONNX, with its header as metadata.
 
     Inputs are points (N, 4 or 5), offsets (N, 5 or 6) float32 and cells (N,) int64 as in
     pillars.Pillars, and for V4 cluster_map (1, 3, H, W) uint8. Outputs are logits (1, A, K), codes
     (1, A, 7) and directions (1, A, 2).
 
     Raises:
-        InputError: the packages of the extra [onnx] are not installed.
+        InputError: onnx or onnxscript is not installed.
     """
     config = header.config
     inputs = {
-        name: torch.zeros(shape, dtype=getattr(torch, kind)) for name, (kind, shape) in _describe_inputs(config).items()
+        name: torch.zeros(shape, dtype=getattr(torch, type_name))
+        for name, (type_name, shape) in _describe_inputs(config).items()
     }
-    inputs["cells"] += torch.arange(COUNT)
+    inputs["cells"] += torch.arange(EXAMPLE_POINTS)
     dynamic = {
         name: None if name == "cluster_map" else {0: torch.export.Dim("points_in_range", min=1)} for name in inputs
     }
-    write_onnx(path, OneCloud(fuse_norms(network), config.grid).eval(), header, inputs, OUTPUTS, dynamic)
+    write_onnx(path, SingleCloudNetwork(fuse_norms(network), config.grid).eval(), header, inputs, OUTPUTS, dynamic)
 
 
 class OnnxNetwork:
@@ -94,11 +95,12 @@ class OnnxNetwork:
         session, text = open_session(path)
         header = Header.from_json(text, str(path), NetworkConfig)
         expected = {
-            name: (f"tensor({kind})", len(shape)) for name, (kind, shape) in _describe_inputs(header.config).items()
+            name: (f"tensor({type_name})", len(shape))
+            for name, (type_name, shape) in _describe_inputs(header.config).items()
         }
         actual = {i.name: (i.type, len(i.shape)) for i in session.get_inputs()}
         if actual != expected or not {*OUTPUTS} <= {o.name for o in session.get_outputs()}:
-            raise InputError(f"{path} has inputs or outputs that do not match its header; export it again")
+            raise InputError(f"the inputs or outputs of {path} do not match its header; export it again")
         return header, OnnxNetwork(session, str(path), header.config)
 
     def to(self, device: str) -> None:
@@ -113,7 +115,5 @@ class OnnxNetwork:
             {name: value for name, value in arrays.items() if name in self.inputs and value is not None},
         )
         if [x.shape for x in (logits, codes, directions)] != self.shapes:
-            raise InputError(
-                f"the outputs of {self.source} have other shapes than a network of its header; export it again"
-            )
+            raise InputError(f"the shapes of the outputs of {self.source} do not match its header; export it again")
         return Prediction(logits[0], lambda anchors: (codes[0, anchors], directions[0, anchors]))

@@ -1,4 +1,4 @@
-"""Parameters of the detector, the source of ROS parameters, command line options and docs."""
+"""Parameters of PointPillars, the source of ROS parameters, command line options and docs."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ class PointPillarsParams(NetworkParams):
     """Network, device and thresholds of PointPillars."""
 
     weights: str = param(
-        "", "Checkpoint (.safetensors) or exported network (.onnx); empty: the shipped one.", fixed=True
+        "", "Checkpoint (.safetensors) or exported network (.onnx); empty: the shipped checkpoint.", fixed=True
     )
     version: str = param(
         "auto",
-        "EG-PointPillars version: v0 (PointPillars), v1 ... v4. auto: that of the weights, by default v4.",
+        "EG-PointPillars version: v0 (PointPillars), v1 ... v4. auto: the version of the weights, by default v4.",
         choices=("auto", "v0", "v1", "v2", "v3", "v4"),
         fixed=True,
     )
     size: str = param(
         "auto",
         "full: the paper's network, for a GPU. compact: for two CPU cores. "
-        "auto: that of the weights, by default compact.",
+        "auto: the size of the weights, by default compact.",
         choices=("auto", "full", "compact"),
         fixed=True,
     )
@@ -39,9 +39,9 @@ class PointPillarsParams(NetworkParams):
     engine: str = make_engine_param()
 
 
-# Paper B uses Patchwork++ and DBSCAN as experts but states no parameters. These parameters were
-# chosen on simulated scans and keep a car in one cluster; those of paper A, for pedestrians, split
-# cars.
+# Paper B uses Patchwork++ and DBSCAN as experts but does not state their parameters. These were
+# chosen on simulated scans so that a car is one cluster; paper A's parameters, which are meant for
+# pedestrians, split cars.
 EXPERT_GROUND = GroundParams(method="patchwork")
 EXPERT_CLUSTERING = ClusteringParams(density=FULL_DENSITY, dbscan=DbscanParams(eps=(0.5, 0.7, 1.0), min_samples=5))
 INPUT = InputParams()
@@ -49,7 +49,7 @@ INPUT = InputParams()
 
 @dataclass(frozen=True)
 class DetectorParams:
-    """All parameter groups of the detector. `ground` and `clustering` configure its experts."""
+    """All parameter groups of PointPillars. `ground` and `clustering` configure its experts."""
 
     input: InputParams = INPUT
     crop: CropParams = CropParams()

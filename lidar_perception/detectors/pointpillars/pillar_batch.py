@@ -12,23 +12,23 @@ from lidar_perception.detectors.pointpillars.pillars import Pillars
 
 
 def make_pillar_batch(clouds: Sequence[Tensor], config: NetworkConfig) -> Pillars[Tensor]:
-    """Assign the points of clouds to pillars, see make_pillars.
+    """Assign the points of several clouds to pillars, see make_pillars.
 
     Args:
         clouds: each (N_b, config.point_columns) float32, all on one device.
     """
     points = torch.cat(list(clouds))
     sizes = torch.tensor([len(cloud) for cloud in clouds], device=points.device)
-    sample = torch.repeat_interleave(sizes)
+    cloud_indices = torch.repeat_interleave(sizes)
     low, high = points.new_tensor(config.low), points.new_tensor(config.high)
-    inside = ((points[:, :3] >= low) & (points[:, :3] < high)).all(dim=1)  # False for NaN
-    inside &= torch.isfinite(points[:, 3:]).all(dim=1)
-    if not inside.all():
-        points, sample = points[inside], sample[inside]
+    is_valid = ((points[:, :3] >= low) & (points[:, :3] < high)).all(dim=1)  # False for NaN
+    is_valid &= torch.isfinite(points[:, 3:]).all(dim=1)
+    if not is_valid.all():
+        points, cloud_indices = points[is_valid], cloud_indices[is_valid]
     height, width = config.grid
     column = ((points[:, 0] - low[0]) / config.cell).long().clamp_(max=width - 1)
     row = ((points[:, 1] - low[1]) / config.cell).long().clamp_(max=height - 1)
-    cells = (sample * height + row) * width + column
+    cells = (cloud_indices * height + row) * width + column
     if config.max_points:
         first_indices = keep_first_per_cell(cells, config.max_points)
         points, cells, column, row = (
@@ -37,7 +37,7 @@ def make_pillar_batch(clouds: Sequence[Tensor], config: NetworkConfig) -> Pillar
             column[first_indices],
             row[first_indices],
         )
-    middle = torch.stack(
+    centre_offsets = torch.stack(
         [
             points[:, 0] - ((column + 0.5) * config.cell + low[0]),
             points[:, 1] - ((row + 0.5) * config.cell + low[1]),
@@ -45,17 +45,19 @@ def make_pillar_batch(clouds: Sequence[Tensor], config: NetworkConfig) -> Pillar
         ],
         dim=1,
     )
-    # The means are over offsets, whose sums stay small, so the order of the points hardly matters.
-    offsets_and_ones = torch.cat([middle, torch.ones_like(middle[:, :1])], dim=1)
+    # Sums of offsets are small, so rounding errors, which depend on the order of the points, are negligible.
+    offsets_and_ones = torch.cat([centre_offsets, torch.ones_like(centre_offsets[:, :1])], dim=1)
     sums = offsets_and_ones.new_zeros(len(clouds) * height * width, 4).index_add_(0, cells, offsets_and_ones)[cells]
-    offsets = torch.cat([middle - sums[:, :3] / sums[:, 3:], middle[:, : config.offset_columns - 3]], dim=1)
+    offsets = torch.cat(
+        [centre_offsets - sums[:, :3] / sums[:, 3:], centre_offsets[:, : config.offset_columns - 3]], dim=1
+    )
     return Pillars(points, offsets, cells, len(clouds), config.grid)
 
 
 def keep_first_per_cell(cells: Tensor, count: int) -> Tensor:
     """Return the indices (M,), ascending, of the first `count` points of each cell."""
-    ordered, indices = torch.sort(cells, stable=True)
-    _, sizes = torch.unique_consecutive(ordered, return_counts=True)
+    sorted_cells, indices = torch.sort(cells, stable=True)
+    _, sizes = torch.unique_consecutive(sorted_cells, return_counts=True)
     starts = torch.repeat_interleave(torch.cumsum(sizes, 0) - sizes, sizes)
     rank = torch.arange(len(cells), device=cells.device) - starts
     return torch.sort(indices[rank < count]).values

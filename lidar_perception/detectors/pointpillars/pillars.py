@@ -1,4 +1,4 @@
-"""Assignment of the points of one cloud to pillars, without padding, on the CPU."""
+"""Assignment of a cloud's points to pillars, without padding, on the CPU."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ Array = TypeVar("Array")  # NumPy array or torch tensor
 
 
 class Pillars(NamedTuple, Generic[Array]):
-    """The N points of B clouds in the range of the network, with their pillars. N may be 0.
+    """The N points of B clouds in the network's range, with their pillars; N may be 0.
 
     Attributes:
         points: (N, 4 or 5) float32 [x y z intensity (id)], metres.
         offsets: (N, 5 or 6) float32 [x_c y_c z_c x_p y_p (z_p)], metres, from the mean of the
             pillar's points and from the centre of the pillar (Lang et al., Section 2.1).
-        cells: (N,) int64, indices into B * H * W cells, row by row, rows along y.
+        cells: (N,) int64 flat indices into (B, H, W), with rows along y.
         batch: B.
         grid: (H, W).
     """
@@ -50,32 +50,32 @@ def make_pillars(cloud: np.ndarray, config: NetworkConfig) -> Pillars[np.ndarray
 
 
 @njit(cache=True, nogil=True)
-def _make_pillars(cloud, low, high, cell, height, width, max_points, columns):
-    """Return points, offsets and cells of Pillars, rounded exactly as in torch."""
+def _make_pillars(cloud, low, high, cell_size, height, width, max_points, offset_columns):
+    """Return points, offsets and cells of Pillars, with exactly the same rounding as torch."""
     points = np.empty_like(cloud)
-    offsets = np.empty((len(cloud), columns), np.float32)
+    offsets = np.empty((len(cloud), offset_columns), np.float32)
     cells = np.empty(len(cloud), np.int64)
     sums = np.zeros((height * width, 4), np.float32)
     half, count = np.float32(0.5), 0
     middle_z = (low[2] + high[2]) / np.float32(2)
     for i in range(len(cloud)):
         point = cloud[i]
-        inside = True
+        is_valid = True
         for axis in range(3):
-            inside &= low[axis] <= point[axis] < high[axis]
+            is_valid &= low[axis] <= point[axis] < high[axis]
         for k in range(3, len(point)):
-            inside &= np.isfinite(point[k])
-        if not inside:
+            is_valid &= np.isfinite(point[k])
+        if not is_valid:
             continue
-        column = min(int((point[0] - low[0]) / cell), width - 1)
-        row = min(int((point[1] - low[1]) / cell), height - 1)
+        column = min(int((point[0] - low[0]) / cell_size), width - 1)
+        row = min(int((point[1] - low[1]) / cell_size), height - 1)
         pillar = row * width + column
         if max_points and sums[pillar, 3] >= max_points:
             continue
         points[count] = point
         cells[count] = pillar
-        offsets[count, 3] = point[0] - ((np.float32(column) + half) * cell + low[0])
-        offsets[count, 4] = point[1] - ((np.float32(row) + half) * cell + low[1])
+        offsets[count, 3] = point[0] - ((np.float32(column) + half) * cell_size + low[0])
+        offsets[count, 4] = point[1] - ((np.float32(row) + half) * cell_size + low[1])
         offsets[count, 2] = point[2] - middle_z
         sums[pillar, 0] += offsets[count, 3]
         sums[pillar, 1] += offsets[count, 4]
@@ -83,10 +83,10 @@ def _make_pillars(cloud, low, high, cell, height, width, max_points, columns):
         sums[pillar, 3] += np.float32(1)
         count += 1
     for i in range(count):
-        total = sums[cells[i]]
-        if columns > 5:
+        pillar_sums = sums[cells[i]]
+        if offset_columns > 5:
             offsets[i, 5] = offsets[i, 2]
-        offsets[i, 0] = offsets[i, 3] - total[0] / total[3]
-        offsets[i, 1] = offsets[i, 4] - total[1] / total[3]
-        offsets[i, 2] -= total[2] / total[3]
+        offsets[i, 0] = offsets[i, 3] - pillar_sums[0] / pillar_sums[3]
+        offsets[i, 1] = offsets[i, 4] - pillar_sums[1] / pillar_sums[3]
+        offsets[i, 2] -= pillar_sums[2] / pillar_sums[3]
     return points[:count].copy(), offsets[:count].copy(), cells[:count].copy()

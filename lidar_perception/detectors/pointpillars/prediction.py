@@ -1,4 +1,4 @@
-"""Output of a PointPillars network, and the interface of networks."""
+"""The output of PointPillars networks, and their common interface."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ class Prediction(NamedTuple):
     """The output of a network for one cloud.
 
     Attributes:
-        logits: (M, K) float32 of the evaluated anchors.
-        boxes_at: boxes_at(rows (N,)) returns codes (N, 7) and directions (N, 2), float32, for rows
-            of logits.
-        anchors: (M,) int64, the anchor of each row; None: all anchors in order.
+        logits: (M, K) float32 logits of the evaluated anchors.
+        compute_boxes: function of row indices (N,) into `logits` that returns codes (N, 7) and
+            directions (N, 2), both float32.
+        anchors: (M,) int64 anchor of each row; None: all anchors in order.
     """
 
     logits: np.ndarray
-    boxes_at: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    compute_boxes: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
     anchors: np.ndarray | None = None
 
 
@@ -31,7 +31,7 @@ class Network(Protocol):
     has_fixed_range: bool  # True if the network cannot be used for another range
 
     def to(self, device: str) -> None:
-        """Move to another device if the network can."""
+        """Move the network to another device if it supports this."""
 
     def __call__(self, pillars: Pillars[np.ndarray], maps: np.ndarray | None) -> Prediction:
         """Return the outputs for one cloud.

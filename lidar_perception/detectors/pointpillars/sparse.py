@@ -1,11 +1,11 @@
-"""Sparse inference of networks without ground on a CPU.
+"""Sparse CPU inference for networks that do not read the ground.
 
-Without ground about 2 % of the pillars contain points. A layer whose receptive field contains
-neither points nor cells of the cluster map has the same value as for an empty cloud: one row of
-numbers, and a few more near the border of the grid. These rows are computed once. For each cloud,
-the layers compute only the other cells, and only those that the head needs. The head is evaluated
-up to REACH cells from a point, because nothing is detected farther away. The result equals that of
-torch up to rounding.
+Without the ground, about 2 % of the pillars contain points. Where the receptive field of a layer
+contains neither points nor cells of the cluster map, the output is the same as for an empty cloud:
+one feature vector, and a few others near the border of the grid. These are computed once. For each
+cloud, the layers compute only the remaining cells, and only those that the head needs. The head is
+evaluated up to REACH cells from a point, because nothing is detected farther away. The result
+equals that of torch up to rounding.
 """
 
 from __future__ import annotations
@@ -25,49 +25,49 @@ from lidar_perception.detectors.pointpillars.prediction import Prediction
 from lidar_perception.detectors.pointpillars.sparse_layers import Grid, Layer, dilate, make_layers, shrink
 
 REACH = 6  # distance from a point, in cells, up to which the head is evaluated
-MIN_PER_PART = 1_000_000  # minimum number of multiplications per task of a thread
+MIN_PER_PART = 1_000_000  # minimum number of multiplications per part of run_in_parts
 
 
 class Map(NamedTuple):
-    """Feature map of H x W cells, in which many cells can share a row.
+    """Feature map of H x W cells; many cells can share a row of features.
 
     Attributes:
-        numbers: (H + 2, W + 2) int32, the row of each cell. The border, which is the padding of a
-            convolution, refers to row 0.
+        row_index: (H + 2, W + 2) int32, the row of each cell. The border, the padding of convolutions,
+            refers to row 0.
         rows: (R, C) float32; row 0 is zero.
     """
 
-    numbers: np.ndarray
+    row_index: np.ndarray
     rows: np.ndarray
 
-    def values_at(self, cells: np.ndarray) -> np.ndarray:
-        """Return the values (M, C) of the cells with flat indices (M,)."""
-        width = self.numbers.shape[1] - 2
-        return self.rows[self.numbers[1 + cells // width, 1 + cells % width]]
+    def get_features(self, cells: np.ndarray) -> np.ndarray:
+        """Return the features (M, C) of the cells with flat indices (M,)."""
+        width = self.row_index.shape[1] - 2
+        return self.rows[self.row_index[1 + cells // width, 1 + cells % width]]
 
 
-def find_unsupported_part(config: NetworkConfig) -> str | None:
-    """Return why SparseNetwork cannot run a network on this machine; None if it can."""
+def find_unsupported_feature(config: NetworkConfig) -> str | None:
+    """Return the reason why SparseNetwork cannot run a network on this machine; None if it can."""
     if not LANES:
         return "this processor has no AVX2"
     if not config.remove_ground:
         return f"{config.version} also reads the ground, which occupies most cells"
     if config.neck != "fpn" or config.fusion != "add":
-        return "its neck does not add its maps"
+        return "its neck is not an FPN that adds its maps"
     if config.zero_row:
-        return "its pillars have rows of zeros"
+        return "its pillars are padded with zeros (zero_row)"
     return None
 
 
 class SparseNetwork:
-    """A network on the CPU, which can be called from several threads.
+    """A network on the CPU that can be called from several threads.
 
     Args:
-        config: config for which find_unsupported_part returns None.
+        config: config for which find_unsupported_feature returns None.
         tensors: state_dict of network.make_network(config), by name.
 
     Raises:
-        WeightsMismatch: the tensors belong to another network.
+        WeightsMismatch: the tensors belong to a different network.
     """
 
     has_fixed_range = False
@@ -77,42 +77,44 @@ class SparseNetwork:
         weights = LayerWeights(tensors, NORM_EPS)
         self.has_map = config.pseudo_map
         self.first_block = 2 + len(config.map_channels) if config.pseudo_map else 1
-        points, offsets = config.point_columns, config.offset_columns
-        linear, bias = weights.take("pillar_net.linear", (config.pillar_channels, points + offsets), "pillar_net.norm")
+        point_columns, offset_columns = config.point_columns, config.offset_columns
+        column_count = point_columns + offset_columns
+        linear, bias = weights.take("pillar_net.linear", (config.pillar_channels, column_count), "pillar_net.norm")
         self.layers = make_layers(config, weights)
         per_cell = config.anchors_per_cell
         self.codes, self.directions = (
             weights.take(f"head.{name}", (per_cell * width, config.fpn_channels, 1, 1))
             for name, width in (("codes", CODE), ("directions", BINS))
         )
-        weights.finish()
-        scales = np.ones(points + offsets, np.float32)
-        scales[:2], scales[4 + offsets :] = config.xy_scale, config.id_scale
-        order = [*range(4), *range(4 + offsets, points + offsets), *range(4, 4 + offsets)]
-        scaled = (linear * scales)[:, order]  # point columns first, then offsets
-        self.pillar_weights = pack_weights(scaled[:, :, None])
+        weights.require_all_taken()
+        scales = np.ones(column_count, np.float32)
+        scales[:2], scales[4 + offset_columns :] = config.xy_scale, config.id_scale
+        # In the checkpoint the cluster id comes after the offsets; here all point columns come first.
+        order = [*range(4), *range(4 + offset_columns, column_count), *range(4, 4 + offset_columns)]
+        pillar_weights = (linear * scales)[:, order]
+        self.pillar_weights = pack_weights(pillar_weights[:, :, None])
         self.pillar_bias = pad_bias(bias, len(self.pillar_weights) * BLOCK)
         self.pillar_columns = pad_channels(config.pillar_channels)
-        self._empty: dict[Grid, list[Map]] = {}
+        self._empty_maps: dict[Grid, list[Map]] = {}
 
     def to(self, device: str) -> None:
         """Do nothing: the network stays on the CPU."""
 
     def __call__(self, pillars: Pillars[np.ndarray], maps: np.ndarray | None) -> Prediction:
-        """Predict at the anchors of all cells up to REACH from a point."""
+        """Return the outputs for the anchors of all cells up to REACH from a point."""
         cells, features, logits = self.evaluate(pillars, maps, REACH)
         per_cell = self.config.anchors_per_cell
         anchors = (cells[:, None] * per_cell + np.arange(per_cell)).ravel()
 
-        def boxes_at(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            rows = features.values_at(cells[chosen // per_cell])[:, : self.config.fpn_channels]
-            numbers = chosen % per_cell
+        def compute_boxes(indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            rows = features.get_features(cells[indices // per_cell])[:, : self.config.fpn_channels]
+            slots = indices % per_cell
             return (
-                _evaluate_at(self.codes, per_cell, numbers, rows),
-                _evaluate_at(self.directions, per_cell, numbers, rows),
+                _evaluate_at(self.codes, per_cell, slots, rows),
+                _evaluate_at(self.directions, per_cell, slots, rows),
             )
 
-        return Prediction(logits.reshape(-1, len(self.config.classes)), boxes_at, anchors)
+        return Prediction(logits.reshape(-1, len(self.config.classes)), compute_boxes, anchors)
 
     def evaluate(
         self, pillars: Pillars[np.ndarray], maps: np.ndarray | None, reach: int | None
@@ -120,9 +122,9 @@ class SparseNetwork:
         """Evaluate the network at the cells of the head that are near a point.
 
         Args:
-            pillars: Pillars of one cloud, which may be empty.
-            maps: Cluster map, see prediction.Network.
-            reach: Maximum distance from a point, in cells of the head; None: all cells.
+            pillars: pillars of one cloud, which may be empty.
+            maps: cluster map, see prediction.Network.
+            reach: maximum distance from a point, in cells of the head; None: all cells.
 
         Returns:
             Flat indices (M,) int64 of the evaluated cells, the map that the head reads, and
@@ -133,7 +135,7 @@ class SparseNetwork:
             assert maps is not None
             inputs.append(_make_cluster_map(maps[0]))
         empty_maps = self._make_empty_maps(pillars.grid)
-        cell_masks = self._choose_cells([source.numbers[1:-1, 1:-1] > 0 for source in inputs], reach)
+        cell_masks = self._choose_cells([source.row_index[1:-1, 1:-1] > 0 for source in inputs], reach)
         *_, features, scores = self._run(inputs, cell_masks, empty_maps)
         logits = scores.rows[len(empty_maps[-1].rows) :, : self.config.anchors_per_cell * len(self.config.classes)]
         return np.flatnonzero(cell_masks[-1]), features, np.ascontiguousarray(logits)
@@ -142,8 +144,8 @@ class SparseNetwork:
         points, offsets, cells = pillars[:3]
         occupied = np.zeros(pillars.grid, bool)
         occupied.ravel()[cells] = True
-        numbers, index = kernels.number_cells(occupied, _make_blank_index(pillars.grid), 1)
-        rows = np.zeros((1 + len(numbers), self.pillar_columns), np.float32)
+        occupied_cells, index = kernels.number_cells(occupied, _make_blank_index(pillars.grid), 1)
+        rows = np.zeros((1 + len(occupied_cells), self.pillar_columns), np.float32)
         kernels.write_pillar_maxima(points, offsets, cells, index, self.pillar_weights, self.pillar_bias, rows)
         return Map(index, rows)
 
@@ -151,24 +153,24 @@ class SparseNetwork:
         """Return a mask (H, W) bool of the cells to compute for each layer."""
         masks = list(occupied)
         for layer in self.layers:
-            masks.append(layer.find_reached(masks))
+            masks.append(layer.find_affected_cells(masks))
         if reach is None:
             masks[-1] = np.ones_like(masks[-1])
         else:
             scale = len(occupied[0]) // len(masks[-1])
             masks[-1] = dilate(shrink(occupied[0], scale), reach)
-        # The layers before the blocks have few cells; selecting among them would cost more than
-        # computing all.
+        # The layers before the blocks have so few cells that selecting some of them would take longer
+        # than computing all.
         required = [None if i < self.first_block else np.zeros_like(mask) for i, mask in enumerate(masks)]
         required[-1] = masks[-1]
         for i, mask in reversed([*enumerate(required)]):
             if mask is not None:
-                self.layers[i - len(occupied)].require(mask, required)
+                self.layers[i - len(occupied)].mark_required_cells(mask, required)
                 masks[i] &= mask
         return masks[len(occupied) :]
 
     def _run(self, inputs: list[Map], cell_masks: Sequence[np.ndarray], empty_maps: Sequence[Map]) -> list[Map]:
-        """Return the maps of all layers, with the rows of an empty cloud outside the masks."""
+        """Return the maps of all layers; cells outside the masks have the values of an empty cloud."""
         maps = list(inputs)
         for layer, mask, background in zip(self.layers, cell_masks, empty_maps):
             maps.append(_compute_map(layer, maps, mask, background))
@@ -178,47 +180,49 @@ class SparseNetwork:
         """Return the maps of all layers for an empty cloud.
 
         Values depend only on the distance to the border, so the layers run on the smallest grid
-        that has all relevant distances.
+        in which all relevant distances occur.
         """
-        if grid not in self._empty:
-            count = 2 if self.has_map else 1
-            margins, grids = [0] * count, [grid] * count
+        if grid not in self._empty_maps:
+            input_count = 2 if self.has_map else 1
+            margins, grids = [0] * input_count, [grid] * input_count
             for layer in self.layers:
-                margins.append(layer.margin(margins))
-                grids.append(layer.grid(grids))
-            coarsest = grid[0] // min(height for height, _ in grids)
+                margins.append(layer.compute_margin(margins))
+                grids.append(layer.compute_grid(grids))
+            max_stride = grid[0] // min(height for height, _ in grids)
             size = max((2 * margin + 1) * (grid[0] // height) for margin, (height, _) in zip(margins, grids))
-            size = -(-size // coarsest) * coarsest
+            size = -(-size // max_stride) * max_stride
             small_grid = min(size, grid[0]), min(size, grid[1])
-            small_grids = [small_grid] * count
+            small_grids = [small_grid] * input_count
             for layer in self.layers:
-                small_grids.append(layer.grid(small_grids))
+                small_grids.append(layer.compute_grid(small_grids))
             inputs = [
                 Map(_make_blank_index(small_grid), np.zeros((1, width), np.float32))
-                for width in (self.pillar_columns, pad_channels(3))[:count]
+                for width in (self.pillar_columns, pad_channels(3))[:input_count]
             ]
             maps = self._run(
                 inputs,
-                [np.ones(g, bool) for g in small_grids[count:]],
+                [np.ones(g, bool) for g in small_grids[input_count:]],
                 [
                     Map(_make_blank_index(g), np.zeros((1, len(layer.bias)), np.float32))
-                    for g, layer in zip(small_grids[count:], self.layers)
+                    for g, layer in zip(small_grids[input_count:], self.layers)
                 ],
             )
-            self._empty[grid] = [_enlarge_map(*arguments) for arguments in zip(maps, margins[count:], grids[count:])]
-        return self._empty[grid]
+            self._empty_maps[grid] = [
+                _enlarge_map(*arguments) for arguments in zip(maps, margins[input_count:], grids[input_count:])
+            ]
+        return self._empty_maps[grid]
 
 
-def _evaluate_at(layer: Weights, per_cell: int, numbers: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def _evaluate_at(layer: Weights, per_cell: int, slots: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Evaluate a layer of the head at N anchors; return (N, C / per_cell).
 
     Args:
-        numbers: (N,) index of each anchor within its cell.
+        slots: (N,) index of each anchor within its cell.
         rows: (N, B) features of the cells.
     """
-    weight = layer.weight.reshape(per_cell, -1, rows.shape[1])[numbers]
+    weight = layer.weight.reshape(per_cell, -1, rows.shape[1])[slots]
     assert layer.bias is not None
-    return (weight @ rows[:, :, None])[:, :, 0] + layer.bias.reshape(per_cell, -1)[numbers]
+    return (weight @ rows[:, :, None])[:, :, 0] + layer.bias.reshape(per_cell, -1)[slots]
 
 
 def _make_blank_index(grid: Grid) -> np.ndarray:
@@ -237,11 +241,11 @@ def _make_cluster_map(maps: np.ndarray) -> Map:
 
 def _compute_map(layer: Layer, maps: list[Map], mask: np.ndarray, background: Map) -> Map:
     """Return the map of a layer, computed in the cells of `mask` (H, W) bool."""
-    first = len(background.rows)
-    cells, index = kernels.number_cells(mask, background.numbers, first)
-    rows = np.empty((first + len(cells), len(layer.bias)), np.float32)
-    rows[:first] = background.rows
-    sums, width = rows[first:], mask.shape[1]
+    background_count = len(background.rows)
+    cells, index = kernels.number_cells(mask, background.row_index, background_count)
+    rows = np.empty((background_count + len(cells), len(layer.bias)), np.float32)
+    rows[:background_count] = background.rows
+    sums, width = rows[background_count:], mask.shape[1]
 
     def compute(begin: int, end: int) -> None:
         bias = layer.bias
@@ -263,23 +267,23 @@ def _compute_map(layer: Layer, maps: list[Map], mask: np.ndarray, background: Ma
 def _enlarge_map(small_map: Map, margin: int, grid: Grid) -> Map:
     """Enlarge the map of an empty cloud from a small grid to a larger one."""
     source_cells, positions = zip(
-        *(_map_axis_cells(size, small - 2, margin) for size, small in zip(grid, small_map.numbers.shape))
+        *(_map_axis_cells(size, padded_size - 2, margin) for size, padded_size in zip(grid, small_map.row_index.shape))
     )
-    rows = small_map.rows[small_map.numbers[1:-1, 1:-1][np.ix_(*source_cells)]].reshape(-1, small_map.rows.shape[1])
+    rows = small_map.rows[small_map.row_index[1:-1, 1:-1][np.ix_(*source_cells)]].reshape(-1, small_map.rows.shape[1])
     index = _make_blank_index(grid)
     index[1:-1, 1:-1] = 1 + positions[0][:, None] * len(source_cells[1]) + positions[1]
     return Map(index, np.concatenate([np.zeros_like(rows[:1]), rows]))
 
 
-def _map_axis_cells(size: int, small: int, margin: int) -> tuple[np.ndarray, np.ndarray]:
+def _map_axis_cells(size: int, small_size: int, margin: int) -> tuple[np.ndarray, np.ndarray]:
     """Map the cells of one axis of a large grid to those of a small grid.
 
     Returns:
-        Indices (K,) of the cells of the small grid to copy, and the position (size,) in these
-        indices for each cell of the large grid.
+        Indices (K,) of the cells of the small grid to copy, and for each cell of the large grid its
+        position in these indices, (size,).
     """
-    if small <= 2 * margin:
+    if small_size <= 2 * margin:
         return np.arange(size), np.arange(size)
-    source_cells = np.r_[: margin + 1, small - margin : small]
+    source_cells = np.r_[: margin + 1, small_size - margin : small_size]
     cell = np.arange(size)
     return source_cells, np.where(cell < size - margin, np.minimum(cell, margin), cell - size + len(source_cells))

@@ -1,7 +1,7 @@
-"""Compiled kernels of the sparse network: convolutions and sums at chosen cells of a map.
+"""Compiled kernels of the sparse network, which process selected cells of a map.
 
 A map of H x W cells is an index (H + 2, W + 2) int32 into rows (R, C) float32. The border of the
-index refers to a row of zeros, the padding of a convolution. Many cells can share a row.
+index, the padding of convolutions, refers to a row of zeros. Many cells can share a row.
 """
 
 from __future__ import annotations
@@ -12,16 +12,17 @@ from numba import njit
 from lidar_perception.detectors.matrix_kernel import BLOCK, ROWS, multiply, multiply_tile
 
 BATCH = 32  # number of tiles per address table
-POINTS = 192  # number of points per call of multiply
+POINTS = 192  # number of points per call of multiply()
 
 
 @njit(cache=True, nogil=True)
 def convolve(index, rows, cells, width, stride, weights, bias, sums, floor, first, last):
-    """Write a convolution of a map plus bias to sums; with an empty bias, add it to the sums.
+    """Write a convolution of a map plus bias to sums; if the bias is empty, add it to the sums.
 
     Args:
         index, rows: the map.
-        cells: (K,) flat indices of cells in a map that is `width` wide and `stride` times coarser.
+        cells: (K,) flat indices of the output cells, in a map that is `width` cells wide and
+            `stride` times coarser.
         weights: (blocks, taps, channels, BLOCK) float32, 9 taps for a 3 x 3 or 1 for a 1 x 1
             convolution.
         bias: (C,) float32 with C = blocks x BLOCK, or empty.
@@ -34,7 +35,7 @@ def convolve(index, rows, cells, width, stride, weights, bias, sums, floor, firs
     inputs, outputs, weight = rows.ctypes.data, sums.ctypes.data, weights.ctypes.data
     accumulate, start = len(bias) == 0, bias.ctypes.data
     map_width = index.shape[1]
-    numbers = index.ravel()
+    flat_index = index.ravel()
     addresses = np.empty((BATCH, taps, ROWS), np.int64)
     destinations = np.empty((BATCH, ROWS), np.int64)
     starts = np.empty(ROWS, np.int64)
@@ -46,10 +47,11 @@ def convolve(index, rows, cells, width, stride, weights, bias, sums, floor, firs
                 row, column = divmod(np.int64(cells[cell]), width)
                 corner = row * stride * map_width + column * stride
                 if taps == 1:
-                    addresses[tile, 0, i] = inputs + row_bytes * numbers[corner + map_width + 1]
+                    addresses[tile, 0, i] = inputs + row_bytes * flat_index[corner + map_width + 1]
                 else:
                     for tap in range(9):
-                        addresses[tile, tap, i] = inputs + row_bytes * numbers[corner + tap // 3 * map_width + tap % 3]
+                        source_row = flat_index[corner + tap // 3 * map_width + tap % 3]
+                        addresses[tile, tap, i] = inputs + row_bytes * source_row
                 destinations[tile, i] = outputs + sum_bytes * cell
         for block in range(blocks):
             starts[:] = start + 4 * BLOCK * block
@@ -72,7 +74,7 @@ def upsample(index, rows, cells, width, scale, bias, sums, first, last):
 
     Args:
         index, rows: the map.
-        cells: (K,) flat indices of cells in the upsampled map, which is `width` wide.
+        cells: (K,) flat indices of cells in the upsampled map, which is `width` cells wide.
         bias: (C,) float32.
         sums: (K, C) float32, the output.
         first, last: range of `cells` to compute.
@@ -94,19 +96,19 @@ def upsample(index, rows, cells, width, scale, bias, sums, first, last):
 
 
 @njit(cache=True, nogil=True)
-def number_cells(chosen, template, start):
-    """Assign the rows start, start + 1, ... to the cells that are True in chosen (H, W).
+def number_cells(mask, template, start):
+    """Assign the rows start, start + 1, ... to the cells in mask (H, W).
 
     Returns:
-        Flat indices (K,) int32 of these cells, and a copy of `template` (H + 2, W + 2) int32, an
-        index, with the rows filled in.
+        Flat indices (K,) int32 of these cells, and a copy of the index `template` (H + 2, W + 2)
+        int32 with these rows.
     """
-    height, width = chosen.shape
+    height, width = mask.shape
     cells, index = np.empty(height * width, np.int32), template.copy()
     count = 0
     for row in range(height):
         for column in range(width):
-            if chosen[row, column]:
+            if mask[row, column]:
                 cells[count] = row * width + column
                 index[row + 1, column + 1] = start + count
                 count += 1
@@ -120,8 +122,8 @@ def write_pillar_maxima(points, offsets, cells, index, weights, bias, rows):
     Args:
         points, offsets: (N, P) and (N, O) float32, concatenated as the input of the layer.
         cells: (N,) int64 cell of each point.
-        index, rows: the map; rows (R, C) start at 0 and are raised to the maximum.
-        weights, bias: as in multiply.
+        index, rows: the map; rows (R, C) must initially be 0.
+        weights, bias: as in multiply().
     """
     width, point_width = index.shape[1] - 2, points.shape[1]
     inputs = np.zeros((POINTS, weights.shape[2]), np.float32)

@@ -1,7 +1,7 @@
-"""The convolutional layers of a PointPillars network as sums at chosen cells.
+"""The convolutional layers of a PointPillars network for sparse evaluation.
 
-A layer is a sum of convolutions of earlier maps, which covers the concatenation of pillars
-and cluster map and the additions of the neck.
+Each layer is a sum of convolutions of earlier maps. Such sums also express the concatenation of
+the pillars with the cluster map, and the additions in the neck.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ class Layer:
     """A convolution of concatenated maps, optionally plus an upsampled coarser map.
 
     Attributes:
-        sources: numbers of the concatenated maps.
-        weights: for each source, (blocks, taps, channels, BLOCK) float32 as in kernels.convolve; 9
-            taps for a 3 x 3 or 1 for a 1 x 1 convolution.
+        sources: indices of the concatenated maps.
+        weights: for each source, (blocks, taps, channels, BLOCK) float32 as in kernels.convolve,
+            with 9 taps for a 3 x 3 or 1 for a 1 x 1 convolution.
         bias: (C,) float32.
         floor: lower limit of the result; 0 for ReLU.
-        coarse: number of the map that is upsampled by `scale` and added; None: no such map.
+        coarse: index of a map to upsample by `scale` and add; None: no such map.
     """
 
     sources: tuple[int, ...]
@@ -42,28 +42,28 @@ class Layer:
 
     @property
     def window(self) -> int:
-        """Number of cells that the convolution reads on each side of the central one."""
+        """Number of cells that the convolution reads on each side of its centre."""
         return 1 if self.weights[0].shape[1] == 9 else 0
 
-    def grid(self, grids: Sequence[Grid]) -> Grid:
+    def compute_grid(self, grids: Sequence[Grid]) -> Grid:
         """Return the size (H, W) of the layer's output, given the sizes of earlier maps."""
         height, width = grids[self.sources[0]]
         return height // self.stride, width // self.stride
 
-    def find_reached(self, occupied: Sequence[np.ndarray]) -> np.ndarray:
-        """Return (H, W) bool, True where the output depends on an occupied cell of earlier maps."""
+    def find_affected_cells(self, occupied: Sequence[np.ndarray]) -> np.ndarray:
+        """Return a mask (H, W) bool of the output cells that depend on an occupied cell of earlier maps."""
         occupied_inputs = np.logical_or.reduce([occupied[source] for source in self.sources])
         mask = dilate(occupied_inputs, self.window)[:: self.stride, :: self.stride]
         if self.coarse is None:
             return mask
         return mask | dilate(enlarge(occupied[self.coarse], self.scale), (self.scale + 1) // 2)
 
-    def require(self, output_cells: np.ndarray, masks: Sequence[np.ndarray | None]) -> None:
-        """Mark the cells of earlier maps that are needed to compute `output_cells`.
+    def mark_required_cells(self, output_cells: np.ndarray, masks: Sequence[np.ndarray | None]) -> None:
+        """Mark the cells of earlier maps that are required to compute `output_cells`.
 
         Args:
             output_cells: (H, W) bool.
-            masks: mask of each map, changed in place; None if the map is computed completely.
+            masks: mask of each map, changed in place; None if the whole map is computed.
         """
         for source in self.sources:
             if (mask := masks[source]) is not None:
@@ -73,11 +73,11 @@ class Layer:
         if self.coarse is not None and (mask := masks[self.coarse]) is not None:
             mask |= dilate(shrink(output_cells, self.scale), 1)
 
-    def margin(self, margins: Sequence[int]) -> int:
-        """Return the width, in cells, of the border where the output for an empty cloud differs.
+    def compute_margin(self, margins: Sequence[int]) -> int:
+        """Return the width in cells of the border where an empty cloud's output may differ from the interior.
 
         Args:
-            margins: the same width of each earlier map.
+            margins: this width for each earlier map.
         """
         width = max(-(-margins[source] // self.stride) for source in self.sources) + self.window
         if self.coarse is None:
@@ -111,14 +111,14 @@ def shrink(mask: np.ndarray, scale: int) -> np.ndarray:
 def make_layers(config: NetworkConfig, tensors: LayerWeights) -> list[Layer]:
     """Return the layers of a network with an additive FPN neck.
 
-    The last layer computes the scores of the head, the one before it the input of the head. Map 0
-    contains the pillars and map 1 the clusters, if the network has that branch. One map per layer
-    follows.
+    The last layer computes the scores of the head, and the one before it the input of the head. Map
+    0 contains the pillars, and map 1 the clusters if the network has that branch. They are followed
+    by one map per layer.
     """
     layers: list[Layer] = []
-    widths = [config.pillar_channels, 3][: 2 if config.pseudo_map else 1]  # widths of the maps
+    widths = [config.pillar_channels, 3][: 2 if config.pseudo_map else 1]  # numbers of channels of the maps
 
-    def add(
+    def add_layer(
         name: str,
         sources: Sequence[int],
         out: int,
@@ -151,22 +151,22 @@ def make_layers(config: NetworkConfig, tensors: LayerWeights) -> list[Layer]:
     if config.pseudo_map:
         last = 1
         for i, out in enumerate(config.map_channels):
-            last = add(f"map_net.{i}", [last], out)
+            last = add_layer(f"map_net.{i}", [last], out)
         sources = [0, last]
     levels = []
     for i, (out, extra_layers, stride) in enumerate(
         zip(config.block_channels, config.block_layers, config.block_strides)
     ):
         for k in range(1 + extra_layers):
-            sources = [add(f"blocks.{i}.{k}", sources, out, stride=1 if k else stride)]
+            sources = [add_layer(f"blocks.{i}.{k}", sources, out, stride=1 if k else stride)]
         levels += sources
-    joined: int | None = None
+    fused: int | None = None
     scales = [*config.block_strides[1:], 1]
     for i in reversed(range(len(levels))):
-        joined = add(
-            f"neck.laterals.{i}", [levels[i]], config.fpn_channels, 1, has_norm=False, coarse=joined, scale=scales[i]
+        fused = add_layer(
+            f"neck.laterals.{i}", [levels[i]], config.fpn_channels, 1, has_norm=False, coarse=fused, scale=scales[i]
         )
-    assert joined is not None
-    features = add("neck.out", [joined], config.fpn_channels)
-    add("head.scores", [features], config.anchors_per_cell * len(config.classes), 1, has_norm=False)
+    assert fused is not None
+    features = add_layer("neck.out", [fused], config.fpn_channels)
+    add_layer("head.scores", [features], config.anchors_per_cell * len(config.classes), 1, has_norm=False)
     return layers

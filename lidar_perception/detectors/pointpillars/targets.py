@@ -1,4 +1,4 @@
-"""Assignment of labelled objects to anchors (Lang et al., Section 4.1; matching as in SECOND)."""
+"""Assignment of training targets to anchors (Lang et al., Section 4.1; matching as in SECOND)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BACKGROUND, IGNORED = -1, -2
 
 
 class Targets(NamedTuple):
-    """Target outputs of the network for B clouds.
+    """Training targets of the network for B clouds.
 
     Attributes:
         labels: (B, A) int64, index into config.classes, BACKGROUND or IGNORED.
@@ -69,18 +69,18 @@ def encode(boxes: Tensor, anchors: Tensor, offset: float) -> tuple[Tensor, Tenso
 
 
 def find_heading_bin(yaw: Tensor, offset: float) -> Tensor:
-    """Return int64 bins: 0 for yaw in [offset, offset + pi), 1 for the other half of the circle."""
+    """Return bins (N,) int64: 0 for yaw in [offset, offset + pi), otherwise 1."""
     relative = torch.remainder(yaw - offset, 2 * math.pi)
     return (relative >= math.pi).long()
 
 
-def assign(anchors: Tensor, config: NetworkConfig, boxes: Tensor, labels: Tensor) -> Targets:
-    """Return the targets (B = 1) of one cloud.
+def assign_targets(anchors: Tensor, config: NetworkConfig, boxes: Tensor, labels: Tensor) -> Targets:
+    """Assign the objects of one cloud to anchors and return the targets (B = 1).
 
     Each class is matched separately. An anchor is positive if its best IoU is at least `matched`,
     background if it is below `unmatched`, and ignored otherwise. The anchors with the highest IoU
-    for an object are always positive. IoU is computed in the bird's-eye view with boxes rotated to
-    the nearest axis. Objects without a size are skipped.
+    with an object are always positive. IoU is computed in the bird's-eye view with boxes rotated to
+    the nearest axis. Objects with a size of 0 or with values that are not finite are skipped.
 
     Args:
         anchors: (A, 7) from make_anchors.
@@ -90,38 +90,43 @@ def assign(anchors: Tensor, config: NetworkConfig, boxes: Tensor, labels: Tensor
     out_labels = labels.new_full((len(anchors),), BACKGROUND)
     codes = anchors.new_zeros(len(anchors), 7)
     bins = labels.new_zeros(len(anchors))
-    usable = (boxes[:, 3:6] > 0).all(dim=1) & torch.isfinite(boxes).all(dim=1)
+    is_usable = (boxes[:, 3:6] > 0).all(dim=1) & torch.isfinite(boxes).all(dim=1)
     for index, spec in enumerate(config.anchors):
-        objects = boxes[usable & (labels == index)].to(anchors.dtype)
+        objects = boxes[is_usable & (labels == index)].to(anchors.dtype)
         candidates = find_near_anchors(anchors, config, objects, index)
         if len(candidates) == 0:
             continue
-        overlap = nearest_axis_iou(anchors[candidates], objects)  # (A', M')
-        best, chosen = overlap.max(dim=1)
-        max_overlap = overlap.max(dim=0).values
-        is_best = (overlap == max_overlap) & (max_overlap > 0)
-        chosen = torch.where(is_best.any(dim=1), is_best.int().argmax(dim=1), chosen)
-        positive = is_best.any(dim=1) | (best >= spec.matched)
-        out_labels[candidates[(best >= spec.unmatched) & ~positive]] = IGNORED
-        positive_anchors, target = candidates[positive], objects[chosen[positive]]
+        iou = nearest_axis_iou(anchors[candidates], objects)  # (A', M')
+        anchor_iou, object_indices = iou.max(dim=1)
+        object_iou = iou.max(dim=0).values
+        is_best = (iou == object_iou) & (object_iou > 0)
+        object_indices = torch.where(is_best.any(dim=1), is_best.int().argmax(dim=1), object_indices)
+        is_positive = is_best.any(dim=1) | (anchor_iou >= spec.matched)
+        out_labels[candidates[(anchor_iou >= spec.unmatched) & ~is_positive]] = IGNORED
+        positive_anchors, matched_objects = candidates[is_positive], objects[object_indices[is_positive]]
         out_labels[positive_anchors] = index
         codes[positive_anchors], bins[positive_anchors] = encode(
-            target, anchors[positive_anchors], config.direction_offset
+            matched_objects, anchors[positive_anchors], config.direction_offset
         )
     return Targets(out_labels[None], codes[None], bins[None])
 
 
 def find_near_anchors(anchors: Tensor, config: NetworkConfig, boxes: Tensor, index: int) -> Tensor:
-    """Return the indices (A',) int64, ascending, of the anchors of class `index` that may overlap
-    one of the boxes (M, 7). Most anchors are far from any object, so this saves most of the work."""
+    """Return the indices (A',) int64, ascending, of anchors that may overlap one of the boxes (M, 7).
+
+    Most anchors are far from all objects, so this saves most of the work.
+
+    Args:
+        index: class of the anchors, index into config.anchors.
+    """
     per_cell = len(config.anchors) * len(config.yaws)
     cells = anchors.view(*config.head_grid, per_cell, 7)
     max_distance = (boxes[:, 3:5].amax(dim=1) + max(config.anchors[index].size[:2])) / 2
     column = (cells[0, :, 0, 0, None] - boxes[:, 0]).abs() <= max_distance  # (W, M)
     row = (cells[:, 0, 0, 1, None] - boxes[:, 1]).abs() <= max_distance  # (H, M)
     is_near = (row[:, None] & column).any(dim=2).flatten()  # (H * W,)
-    first = torch.nonzero(is_near) * per_cell + index * len(config.yaws)  # (cells, 1)
-    return (first + torch.arange(len(config.yaws), device=anchors.device)).reshape(-1)
+    first_anchors = torch.nonzero(is_near) * per_cell + index * len(config.yaws)  # (cells, 1)
+    return (first_anchors + torch.arange(len(config.yaws), device=anchors.device)).reshape(-1)
 
 
 def to_sparse(targets: Targets) -> SparseTargets:
@@ -131,17 +136,17 @@ def to_sparse(targets: Targets) -> SparseTargets:
     return SparseTargets(anchors.numpy(), *(part[0][anchors].numpy() for part in targets))
 
 
-def to_dense(clouds: Sequence[SparseTargets], anchors: int, device: torch.device) -> Targets:
-    """Convert the SparseTargets of B clouds with `anchors` anchors each to Targets on a device."""
-    indices = torch.from_numpy(np.concatenate([cloud.anchors + i * anchors for i, cloud in enumerate(clouds)])).to(
+def to_dense(clouds: Sequence[SparseTargets], anchor_count: int, device: torch.device) -> Targets:
+    """Convert the SparseTargets of B clouds to Targets on a device."""
+    indices = torch.from_numpy(np.concatenate([cloud.anchors + i * anchor_count for i, cloud in enumerate(clouds)])).to(
         device
     )
 
     def scatter(parts: Sequence[np.ndarray], default: int) -> Tensor:
         values = torch.from_numpy(np.concatenate(parts)).to(device)
-        shape = (len(clouds) * anchors, *values.shape[1:])
+        shape = (len(clouds) * anchor_count, *values.shape[1:])
         out = torch.full(shape, default, dtype=values.dtype, device=device)
-        return out.index_copy_(0, indices, values).view(len(clouds), anchors, *values.shape[1:])
+        return out.index_copy_(0, indices, values).view(len(clouds), anchor_count, *values.shape[1:])
 
     return Targets(
         scatter([c.labels for c in clouds], BACKGROUND),
@@ -151,18 +156,17 @@ def to_dense(clouds: Sequence[SparseTargets], anchors: int, device: torch.device
 
 
 def nearest_axis_iou(boxes: Tensor, others: Tensor) -> Tensor:
-    """Return the bird's-eye-view IoU (N, M) of boxes (N, 7) and others (M, 7), each rotated to the
-    nearest axis."""
-    (low, high), (other_low, other_high) = _align(boxes), _align(others)
+    """Return the bird's-eye-view IoU (N, M) of boxes (N, 7) and others (M, 7) rotated to the nearest axis."""
+    (low, high), (other_low, other_high) = _align_boxes(boxes), _align_boxes(others)
     intersection = torch.minimum(high[:, None], other_high) - torch.maximum(low[:, None], other_low)
     intersection = intersection.clamp_(min=0).prod(dim=2)
     area, other_area = (high - low).prod(dim=1), (other_high - other_low).prod(dim=1)
     return intersection / (area[:, None] + other_area - intersection)
 
 
-def _align(boxes: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the corners low (N, 2) and high (N, 2) of boxes (N, 7) rotated to the nearest axis."""
-    folded = torch.remainder(boxes[:, 6] + math.pi / 2, math.pi) - math.pi / 2
-    is_sideways = (folded.abs() > math.pi / 4)[:, None]
-    half = torch.where(is_sideways, boxes[:, [4, 3]], boxes[:, [3, 4]]) / 2
-    return boxes[:, :2] - half, boxes[:, :2] + half
+def _align_boxes(boxes: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotate boxes (N, 7) to the nearest axis; return their corners low (N, 2) and high (N, 2)."""
+    line_angle = torch.remainder(boxes[:, 6] + math.pi / 2, math.pi) - math.pi / 2
+    is_sideways = (line_angle.abs() > math.pi / 4)[:, None]
+    half_sizes = torch.where(is_sideways, boxes[:, [4, 3]], boxes[:, [3, 4]]) / 2
+    return boxes[:, :2] - half_sizes, boxes[:, :2] + half_sizes

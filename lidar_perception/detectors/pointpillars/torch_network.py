@@ -35,12 +35,12 @@ class TorchNetwork:
         device_maps = None if maps is None else torch.from_numpy(maps).to(self.device)
         dtype = choose_dtype(self.amp, self.device)
         with torch.autocast(torch.device(self.device).type, dtype, enabled=dtype is not None):
-            features = self.network.features(Pillars(points, offsets, cells, *pillars[3:]), device_maps).float()
+            features = self.network.compute_features(Pillars(points, offsets, cells, *pillars[3:]), device_maps).float()
         head = self.network.head
 
         @torch.inference_mode()
-        def boxes_at(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            codes, directions = head.boxes_at(features, torch.from_numpy(chosen).to(self.device))
+        def compute_boxes(indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            codes, directions = head.compute_boxes(features, torch.from_numpy(indices).to(self.device))
             return codes.float().cpu().numpy(), directions.float().cpu().numpy()
 
-        return Prediction(head.logits(features)[0].float().cpu().numpy(), boxes_at)
+        return Prediction(head.compute_logits(features)[0].float().cpu().numpy(), compute_boxes)

@@ -14,7 +14,7 @@ from lidar_perception.camera import Camera
 from lidar_perception.classes import DONT_CARE, TABLE
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.data.frame import Frame, Recording
-from lidar_perception.detectors.open import default_params
+from lidar_perception.detectors.open import make_default_params
 from lidar_perception.detectors.pointnet.clusters import Clusters, make_clusters
 from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams, PointNetParams
@@ -164,7 +164,7 @@ def measure_network(weights: Path, settings: Mapping[str, Any], recording: Recor
         weights, "cpu", PointNetDetectorParams(pointnet=PointNetParams(warm_up=False))
     ).classifier
     config, background = classifier.config, len(classifier.classes)
-    params = with_values(default_params(weights), settings)
+    params = with_values(make_default_params(weights), settings)
 
     def measure(frame: Frame) -> tuple[np.ndarray, np.ndarray] | None:
         truth = frame.truth()

@@ -14,10 +14,10 @@ from lidar_perception.camera import Calibration
 from lidar_perception.detectors.normalized_view import restore_detections
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointnet.box_head import BoxTargets, encode
-from lidar_perception.detectors.pointnet.calibration import calibrate, calibration_error
+from lidar_perception.detectors.pointnet.calibration import calibrate, compute_calibration_error
 from lidar_perception.detectors.pointnet.clusters import ClusterInput, Clusters, compute_centroids, make_network_input
 from lidar_perception.detectors.pointnet.config import PointNetConfig
-from lidar_perception.detectors.pointnet.losses import cluster_loss
+from lidar_perception.detectors.pointnet.losses import compute_cluster_loss
 from lidar_perception.detectors.pointnet.network import PointNet
 from lidar_perception.detectors.pointnet.predict import predict, select_detections
 from lidar_perception.detectors.pointnet.torch_network import TorchPointNet, run_network
@@ -80,7 +80,9 @@ class ClusterPreparation:
             rows = slice(clusters.first[k], clusters.first[k + 1])
             clusters.points[rows], _ = vary_background(clusters.points[rows], feet[k], self.augment, rng)
         clusters, boxes = augment_clusters(clusters, boxes, scene.is_box_crop[indices], self.augment, rng)
-        inputs = make_network_input(clusters, self.config.points, int(rng.integers(1 << 30)), self.config.farthest)
+        inputs = make_network_input(
+            clusters, self.config.points, int(rng.integers(1 << 30)), self.config.farthest_count
+        )
         has_box = (labels >= 0) & (labels < len(self.config.classes))
         classes = np.where(has_box, labels, 0)
         targets = encode(boxes, classes, inputs.centres, inputs.azimuths, self.config)
@@ -181,7 +183,7 @@ def make_loss(config: PointNetConfig, device: torch.device) -> Callable:
             tensor([i.points for i in inputs]), tensor([i.valid for i in inputs]), tensor([i.context for i in inputs])
         )
         targets = BoxTargets(*(tensor(parts) for parts in zip(*(s.targets for s in samples))))
-        losses = cluster_loss(
+        losses = compute_cluster_loss(
             outputs, tensor([s.labels for s in samples]), targets, tensor([s.has_box for s in samples])
         )
         return losses.total, {
@@ -245,7 +247,7 @@ def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) ->
         logits = torch.cat(
             [
                 run_network(
-                    network, make_network_input(s.clusters, config.points, farthest=config.farthest)
+                    network, make_network_input(s.clusters, config.points, farthest_count=config.farthest_count)
                 ).logits.cpu()
                 for s in scenes
                 if len(s.clusters)
@@ -266,5 +268,5 @@ def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) ->
         **metrics,
         "accuracy": 100 * float(correct.mean()) if len(correct) else math.nan,
         "object_accuracy": 100 * float(correct[is_object].mean()) if is_object.any() else math.nan,
-        "calibration_error": calibration_error(probabilities, labels),
+        "calibration_error": compute_calibration_error(probabilities, labels),
     }, calibration

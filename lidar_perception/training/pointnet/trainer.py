@@ -13,7 +13,7 @@ import torch
 
 from lidar_perception.detectors.checkpoint import POINTPILLARS, read_network_name
 from lidar_perception.detectors.pointnet.config import PointNetConfig
-from lidar_perception.detectors.pointnet.network import PointNet, make_pointnet
+from lidar_perception.detectors.pointnet.network import PointNet
 from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.weights_file import find_pointnet_weights, find_proposer_weights, require_weights
 from lidar_perception.training.augment import TrainingScene
@@ -89,7 +89,7 @@ class PointNetTrainer:
 
         usable_scenes = select_usable_scenes(scenes, prepare_scene)  # also compiles kernels
         cutting, cut_scenes = measure_duration(lambda: [cut_scene(scene) for scene in usable_scenes])
-        network = make_pointnet(self.config).to(device)
+        network = PointNet(self.config).to(device)
         step = measure_step(
             network,
             make_loss(self.config, device),
@@ -146,7 +146,7 @@ class PointNetTrainer:
         init: Path | None,
     ) -> Task:
         torch.manual_seed(params.seed)
-        network = load_initial_weights(make_pointnet(self.config), init, PointNetConfig).to(device)
+        network = load_initial_weights(PointNet(self.config), init, PointNetConfig).to(device)
         scenes: list[ValidationClusters] = []
 
         def validate(module: PointNet) -> Validation:

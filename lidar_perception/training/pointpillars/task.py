@@ -17,10 +17,10 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.normalized_view import NormalizedView
 from lidar_perception.detectors.params import ScoreParams
-from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
+from lidar_perception.detectors.pointpillars.anchors import get_anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.expert import make_network_input
-from lidar_perception.detectors.pointpillars.losses import detection_loss
+from lidar_perception.detectors.pointpillars.losses import compute_detection_loss
 from lidar_perception.detectors.pointpillars.params import DetectorParams, PointPillarsParams
 from lidar_perception.detectors.pointpillars.pillar_batch import make_pillar_batch
 from lidar_perception.detectors.pointpillars.targets import (
@@ -28,7 +28,7 @@ from lidar_perception.detectors.pointpillars.targets import (
     IGNORED,
     SparseTargets,
     Targets,
-    assign,
+    assign_targets,
     find_near_anchors,
     nearest_axis_iou,
     to_dense,
@@ -168,7 +168,7 @@ def _assign_targets(
     Anchors on other objects, and anchors that touch a DontCare region, are ignored.
     """
     all_boxes, classes, target_mask = map(torch.from_numpy, (boxes, labels, is_target))
-    targets = assign(anchors, config, all_boxes[target_mask], classes[target_mask])
+    targets = assign_targets(anchors, config, all_boxes[target_mask], classes[target_mask])
     anchor_labels = targets.labels[0]
     for index, spec in enumerate(config.anchors):
         for ignored_boxes, min_iou in (
@@ -185,14 +185,14 @@ def _assign_targets(
 
 def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
     """Return loss(network, samples) -> (total, parts), see Task."""
-    classes = torch.from_numpy(anchor_classes(config)).to(device)
+    classes = torch.from_numpy(get_anchor_classes(config)).to(device)
 
     def loss(network: nn.Module, samples: Sequence[Sample]) -> tuple[Tensor, dict[str, Tensor]]:
         pillars = make_pillar_batch([torch.from_numpy(s.points).to(device) for s in samples], config)
         cluster_maps = [s.cluster_map for s in samples if s.cluster_map is not None]
         maps = torch.from_numpy(np.stack(cluster_maps)).to(device) if cluster_maps else None
         targets = to_dense([sample.targets for sample in samples], len(classes), device)
-        losses = detection_loss(network(pillars, maps), targets, classes)
+        losses = compute_detection_loss(network(pillars, maps), targets, classes)
         return losses.total, {
             "classes": losses.classes.detach(),
             "boxes": losses.boxes.detach(),

@@ -16,7 +16,7 @@ import torch
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
-from lidar_perception.detectors.pointpillars.network import PointPillars, channels_last, make_network
+from lidar_perception.detectors.pointpillars.network import PointPillars, make_network, to_channels_last
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
 from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
@@ -87,7 +87,7 @@ class PointPillarsTrainer:
         cut_objects(usable_scenes[0], self.config.classes, params.data.min_points)  # triggers compilation
         cutting, databases = measure_duration(cut_all)
         network = make_network(self.config).to(device)
-        channels_last(network)
+        to_channels_last(network)
         with tempfile.TemporaryDirectory() as folder:
             join_databases(databases).save(Path(folder) / OBJECTS)
             prepare_pasted = replace(
@@ -158,7 +158,7 @@ class PointPillarsTrainer:
     ) -> Task:
         torch.manual_seed(params.seed)
         network = load_initial_weights(make_network(self.config), init, NetworkConfig)
-        network = channels_last(network.to(device))
+        network = to_channels_last(network.to(device))
         reported: set[str] = set()
 
         def validate(module: PointPillars) -> Validation:
