@@ -189,9 +189,9 @@ def _add_track(state: State, action: Action, motion: Motion) -> Outcome:
 
 def _set_box(state: State, action: Action, motion: Motion) -> Outcome:
     track, frame = require_track(state, action.get("track")), require_frame(action, motion)
-    removed = track.removed_frames - {frame}
-    boxes = apply_correction(track.boxes, removed, frame, require_box_values(action), motion)
-    return _replace_tracks(state, replace(track, boxes=boxes, removed_frames=removed))
+    removed_frames = track.removed_frames - {frame}
+    boxes = apply_correction(track.boxes, removed_frames, frame, require_box_values(action), motion)
+    return _replace_tracks(state, replace(track, boxes=boxes, removed_frames=removed_frames))
 
 
 def _set_size(state: State, action: Action, motion: Motion) -> Outcome:
@@ -211,19 +211,19 @@ def _remove_box(state: State, action: Action, motion: Motion) -> Outcome:
     boxes = {f: b for f, b in track.boxes.items() if f != frame}
     if not boxes:
         return {track.id: None}, _drop_seeds(state.seeds, track.id), state.checked_frames
-    removed = track.removed_frames | {frame}
-    return _replace_tracks(state, replace(track, boxes=boxes, removed_frames=removed))
+    removed_frames = track.removed_frames | {frame}
+    return _replace_tracks(state, replace(track, boxes=boxes, removed_frames=removed_frames))
 
 
 def _interpolate_track(state: State, action: Action, motion: Motion) -> Outcome:
     track, frame = require_track(state, action.get("track")), require_frame(action, motion)
-    removed = track.removed_frames - {frame}
-    boxes = reinterpolate_frame(track.boxes, removed, frame, motion)
+    removed_frames = track.removed_frames - {frame}
+    boxes = reinterpolate_frame(track.boxes, removed_frames, frame, motion)
     if boxes is None:
         raise InputError(
             f"frame {frame} of track {track.id} cannot be interpolated: it needs a key box before and after"
         )
-    return _replace_tracks(state, replace(track, boxes=boxes, removed_frames=removed))
+    return _replace_tracks(state, replace(track, boxes=boxes, removed_frames=removed_frames))
 
 
 def _drop_seeds(seeds: Seeds, track: int) -> Seeds:
@@ -277,11 +277,11 @@ def _merge_tracks(state: State, action: Action, motion: Motion) -> Outcome:
     first, second = (require_track(state, track_id) for track_id in pair)
     boxes = {**second.boxes, **first.boxes}
     boxes |= {f: b for f, b in second.boxes.items() if b.kind == KEY and boxes[f].kind != KEY}
-    removed = (first.removed_frames | second.removed_frames) - boxes.keys()
+    removed_frames = (first.removed_frames | second.removed_frames) - boxes.keys()
     merged = replace(
         first,
         boxes=boxes,
-        removed_frames=removed,
+        removed_frames=removed_frames,
         extra={**second.extra, **first.extra},
         is_edited=True,
         is_partly_tracked=False,
@@ -332,8 +332,8 @@ def _trim_track(state: State, action: Action, motion: Motion) -> Outcome:
         raise InputError(f"all boxes of track {track.id} are {side} frame {frame}; reject the track instead")
     seeds = tuple(s for s in state.seeds if s[1] != track.id or s[0] not in frames_with_box)
     # A partly tracked object has no boxes yet in some frames that tracking would add later.
-    removed = track.removed_frames | (trimmed_frames if track.is_partly_tracked else frames_with_box)
-    return {track.id: replace(track, boxes=boxes, removed_frames=removed)}, seeds, state.checked_frames
+    removed_frames = track.removed_frames | (trimmed_frames if track.is_partly_tracked else frames_with_box)
+    return {track.id: replace(track, boxes=boxes, removed_frames=removed_frames)}, seeds, state.checked_frames
 
 
 def _set_checked(state: State, action: Action, motion: Motion) -> Outcome:

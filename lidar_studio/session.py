@@ -213,11 +213,11 @@ class Session:
         with self._lock:
             if proposals is None or self._cancelled.is_set() or (seed is not None and not self._has_waiting_clicks()):
                 return
-            tracks, removed = merge_proposals(self.state, proposals, self.motion)
+            tracks, removed_ids = merge_proposals(self.state, proposals, self.motion)
             # Undoing a click also undoes its proposals, but never the first proposals of a drive.
             belongs_to_seed = seed == self.state.seq and self.has_proposals
             undo_mode = {} if by_person else {"joins": True} if belongs_to_seed else {"beside": True}
-            self._record({"do": "propose", "tracks": tracks, "removed": removed, **undo_mode}, page_id)
+            self._record({"do": "propose", "tracks": tracks, "removed": removed_ids, **undo_mode}, page_id)
             self.has_proposals = True
 
     def _track_clicks(self, page_id: str, seed: int | None) -> None:
@@ -309,13 +309,13 @@ class Session:
         nearby_frames = range(max(frame - NEARBY_FRAMES, 0), min(frame + NEARBY_FRAMES + 1, count))
         is_long = count > 2 * NEARBY_FRAMES
         proposals = self.proposer.make_proposals(state, self.motion, nearby_frames if is_long else None)
-        tracks, removed = merge_proposals(state, proposals or [], self.motion)
+        tracks, removed_ids = merge_proposals(state, proposals or [], self.motion)
         if is_long:  # proposals in nearby frames must not replace tracks of the whole drive
             tracks = [t for t in tracks if t.id == track.id or t.id not in state.tracks]
-            removed = []
+            removed_ids = []
         clicked_track = next((t for t in tracks if t.id == track.id), track)
         tracks = [t for t in tracks if t is not clicked_track] + [replace(clicked_track, is_partly_tracked=is_long)]
-        return {**action, "tracks": tracks, "removed": removed}
+        return {**action, "tracks": tracks, "removed": removed_ids}
 
     def _record(self, action: Action, page_id: str) -> int:
         """Apply an action, write it to the journal, notify the listeners, and return its number."""
@@ -337,10 +337,16 @@ class Session:
         self, action: Action, change: Change, page_id: str, encode: Callable[[Track], dict[str, Any]]
     ) -> None:
         tracks = [encode(track) for _, track in change.tracks.values() if track]
-        removed = [n for n, (_, track) in change.tracks.items() if track is None]
-        hidden = () if action["do"] == "merge" else ("tracks", "removed", "poses", "kept")
-        public_action = {k: v for k, v in action.items() if k not in hidden}
-        event = {"seq": self.state.seq, "by": page_id, "action": public_action, "tracks": tracks, "removed": removed}
+        removed_ids = [n for n, (_, track) in change.tracks.items() if track is None]
+        hidden_fields = () if action["do"] == "merge" else ("tracks", "removed", "poses", "kept")
+        public_action = {k: v for k, v in action.items() if k not in hidden_fields}
+        event = {
+            "seq": self.state.seq,
+            "by": page_id,
+            "action": public_action,
+            "tracks": tracks,
+            "removed": removed_ids,
+        }
         self.notify({**event, **self.summarize()})
 
     def notify(self, event: dict[str, Any]) -> None:

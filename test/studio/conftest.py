@@ -6,7 +6,7 @@ import socket
 
 import pytest
 from browsing import browsing
-from labeling_pages import Label, find_nearest_person, opened, serving
+from labeling_pages import Label, find_nearest_person, open_page, run_server
 
 from lidar_perception.data.open import open_recording
 
@@ -28,13 +28,13 @@ def labels(drive_bag, tmp_path_factory):
     """A running label server, on a port that stays the same after a restart."""
     out, port = tmp_path_factory.mktemp("labels"), free_port()
     arguments = ("label", "--data", str(drive_bag), "--out", str(out), "--no-open", "--no-propose", "--port", str(port))
-    with serving(*arguments) as server:
+    with run_server(*arguments) as server:
         yield Label(server.process, server.url, out, arguments)
 
 
 @pytest.fixture(scope="module")
 def first_page(browser, labels):
-    with opened(browser, labels.url) as made:
+    with open_page(browser, labels.url) as made:
         yield made
 
 

@@ -17,7 +17,7 @@ from types import SimpleNamespace
 import aiohttp
 import numpy as np
 import pytest
-from labeling_pages import serving
+from labeling_pages import run_server
 from samples import WALKER
 from yarl import URL
 
@@ -106,7 +106,7 @@ def run_on_page(url, use_page):
 @pytest.fixture(scope="module")
 def server_url(written, tmp_path_factory):
     """Address of a server that is shared by several tests, so its labels are arbitrary."""
-    with serving(*make_label_arguments(written, tmp_path_factory.mktemp("labels"))) as server:
+    with run_server(*make_label_arguments(written, tmp_path_factory.mktemp("labels"))) as server:
         yield server.url
 
 
@@ -285,7 +285,7 @@ def test_killed_server_loses_no_labels(written, tmp_path):
         await page.send_action(do="undo")
         return await page.get_json("/api/state")
 
-    with serving(*make_label_arguments(written, tmp_path)) as server:
+    with run_server(*make_label_arguments(written, tmp_path)) as server:
         before = run_on_page(server.url, edit)
         command = make_command_line(*make_label_arguments(written, tmp_path))
         second_server = subprocess.run(command, text=True, capture_output=True)
@@ -293,7 +293,7 @@ def test_killed_server_loses_no_labels(written, tmp_path):
         server.process.kill()
     with open(tmp_path / "journal.jsonl", "a") as journal:
         journal.write('{"seq": 4, "do": "re')
-    with serving(*make_label_arguments(written, tmp_path)) as server:
+    with run_server(*make_label_arguments(written, tmp_path)) as server:
         assert run_on_page(server.url, lambda page: page.get_json("/api/state")) == before
         assert run_on_page(server.url, lambda page: page.send_action(do="redo")) == {"seq": 4}
         os.kill(server.process.pid, signal.SIGINT)
@@ -318,10 +318,10 @@ def test_full_disk_is_reported_and_labels_match_the_journal(written, tmp_path):
                     return before
         raise AssertionError("the disk was never full")
 
-    with serving(*make_label_arguments(written, tmp_path), before=limit_file_size) as server:
+    with run_server(*make_label_arguments(written, tmp_path), before=limit_file_size) as server:
         before = run_on_page(server.url, fill)
     assert len(before["tracks"]) > 3
-    with serving(*make_label_arguments(written, tmp_path)) as server:
+    with run_server(*make_label_arguments(written, tmp_path)) as server:
         assert run_on_page(server.url, lambda page: page.get_json("/api/state")) == before
 
 
@@ -344,11 +344,11 @@ def test_exported_labels_are_imported_unchanged(written, tmp_path):
                 assert reply.status == 400 and (await reply.json())["error"]
         return first, await page.get_json("/api/state")
 
-    with serving(*make_label_arguments(written, tmp_path / "one")) as server:
+    with run_server(*make_label_arguments(written, tmp_path / "one")) as server:
         result, state = run_on_page(server.url, make)
     assert result["boxes"] == 4 and result["frames"] == 3
     import_options = ["--import", f"openlabel:{result['path']}"]
-    with serving(*make_label_arguments(written, tmp_path / "two", *import_options)) as server:
+    with run_server(*make_label_arguments(written, tmp_path / "two", *import_options)) as server:
         imported_state = run_on_page(server.url, lambda page: page.get_json("/api/state"))
         assert {(t["class"], tuple(map(tuple, (b[:8] for b in t["boxes"])))) for t in imported_state["tracks"]} == {
             (t["class"], tuple(map(tuple, (b[:8] for b in t["boxes"])))) for t in state["tracks"]
@@ -359,7 +359,7 @@ def test_exported_labels_are_imported_unchanged(written, tmp_path):
 
 def test_labels_of_the_drive_are_shown_only_on_request(server_url, written, tmp_path):
     assert run_on_page(server_url, lambda page: page.get_json("/api/labels/0"))["labels"] == []
-    with serving(*make_label_arguments(written, tmp_path, "--show-labels")) as server:
+    with run_server(*make_label_arguments(written, tmp_path, "--show-labels")) as server:
         results = run_on_page(server.url, lambda page: page.get_json("/api/labels/0"))
         ((*box, name, _),) = results["labels"]
         assert np.allclose(box, WALKER) and name == "Pedestrian"

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from labeling_pages import boxes_of, drag, faces, middle, opened, serving
+from labeling_pages import drag, get_boxes, get_centre, get_face_positions, open_page, run_server
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.geometry import wrap_angle
@@ -15,7 +15,7 @@ from lidar_perception.geometry import wrap_angle
 pytestmark = pytest.mark.no_cover  # covered by other tests
 
 
-def test_click_on_a_person_makes_a_track_and_a_seed(page, labels, person):
+def test_click_on_a_person_creates_a_track_and_a_seed(page, labels, person):
     seeds = len(labels.state()["seeds"])
     number = labels.seed(page, person)
     state, box = labels.state(), labels.box(number)
@@ -39,7 +39,7 @@ def test_seed_works_without_a_mouse(page, labels, person):
 
 
 def test_keys_accept_reject_and_reopen_and_update_the_progress(page, labels, person):
-    number = labels.chosen(page, person)
+    number = labels.add_track(page, person)
     for key, state in (("r", "rejected"), ("a", "accepted"), ("u", "proposed")):
         page.keyboard.press(key)
         labels.wait(page, number, lambda t, s=state: t["state"] == s)
@@ -51,8 +51,8 @@ def test_keys_accept_reject_and_reopen_and_update_the_progress(page, labels, per
 
 
 def test_all_controls_fit_into_half_a_screen(page, labels, person):
-    labels.chosen(page, person)
-    whole = page.viewport_size
+    labels.add_track(page, person)
+    viewport_size = page.viewport_size
     page.set_viewport_size({"width": 800, "height": 900})
     parts = "header nav button, #frame-name, #filters button, #numbers input, #actions button"
     outside = page.evaluate(
@@ -63,12 +63,12 @@ def test_all_controls_fit_into_half_a_screen(page, labels, person):
     )
     under = page.evaluate("""() => document.getElementById('timeline').getBoundingClientRect().right
         - document.getElementById('right').getBoundingClientRect().left""")
-    page.set_viewport_size(whole)
+    page.set_viewport_size(viewport_size)
     assert outside == [] and under < 1
 
 
 @pytest.mark.parametrize(
-    ("where", "name", "way"),
+    ("selector", "name", "offset"),
     [
         ("[data-view=top]", "+x", (40, 0)),
         ("[data-view=side]", "+z", (0, -25)),
@@ -76,12 +76,12 @@ def test_all_controls_fit_into_half_a_screen(page, labels, person):
         ("#handles", "+z", (0, -40)),
     ],
 )
-def test_dragged_face_moves_alone(page, labels, person, where, name, way):
-    number = labels.chosen(page, person)
+def test_dragged_face_moves_alone(page, labels, person, selector, name, offset):
+    number = labels.add_track(page, person)
     before = labels.box(number)
-    drag(page, middle(page, f"{where} circle[data-handle='{name}']"), way)
-    labels.wait(page, number, lambda t: boxes_of(t)[0] != before)
-    old, new = faces(before), faces(labels.box(number))
+    drag(page, get_centre(page, f"{selector} circle[data-handle='{name}']"), offset)
+    labels.wait(page, number, lambda t: get_boxes(t)[0] != before)
+    old, new = get_face_positions(before), get_face_positions(labels.box(number))
     moved = [face for face in old if not np.allclose(old[face], new[face], atol=1e-6)]
     assert moved == [name], moved
     assert new[name] > old[name]
@@ -89,7 +89,7 @@ def test_dragged_face_moves_alone(page, labels, person, where, name, way):
 
 @pytest.mark.parametrize("key", ["s", "Escape"])
 def test_handles_disappear_immediately_with_the_key(page, labels, person, key):
-    labels.chosen(page, person)
+    labels.add_track(page, person)
     page.wait_for_function("() => document.getElementById('handles').style.display === ''")
     assert (
         page.evaluate(
@@ -105,57 +105,57 @@ def test_handles_disappear_immediately_with_the_key(page, labels, person, key):
 
 
 def test_body_is_dragged_horizontally_and_turns_about_its_centre(page, labels, person):
-    number = labels.chosen(page, person)
+    number = labels.add_track(page, person)
     before = labels.box(number)
-    drag(page, middle(page, "[data-view=top] rect.body"), (30, 10))
-    labels.wait(page, number, lambda t: boxes_of(t)[0] != before)
+    drag(page, get_centre(page, "[data-view=top] rect.body"), (30, 10))
+    labels.wait(page, number, lambda t: get_boxes(t)[0] != before)
     moved = labels.box(number)
     assert moved[2:] == pytest.approx(before[2:]) and math.dist(moved[:2], before[:2]) > 0.1
-    x, y = middle(page, "[data-view=top] circle.turn")
-    centre = middle(page, "[data-view=top]")
+    x, y = get_centre(page, "[data-view=top] circle.turn")
+    centre = get_centre(page, "[data-view=top]")
     drag(page, (x, y), (centre[0] - x, centre[1] - 60 - y))  # from the right to the top: a quarter turn
-    labels.wait(page, number, lambda t: boxes_of(t)[0] != moved)
+    labels.wait(page, number, lambda t: get_boxes(t)[0] != moved)
     turned = labels.box(number)
     assert turned[:6] == pytest.approx(moved[:6], abs=1e-6)
     assert wrap_angle(turned[6] - moved[6]) == pytest.approx(math.pi / 2, abs=0.1)
 
 
 def test_arrow_keys_move_along_the_box_as_one_action(page, labels, person):
-    number = labels.chosen(page, person)
+    number = labels.add_track(page, person)
     before, actions = labels.box(number), labels.state()["seq"]
     for _ in range(3):
         page.keyboard.down("ArrowUp")
     page.keyboard.up("ArrowUp")
-    labels.wait(page, number, lambda t: boxes_of(t)[0] != before)
+    labels.wait(page, number, lambda t: get_boxes(t)[0] != before)
     after = labels.box(number)
     step = 0.15 * np.array([math.cos(before[6]), math.sin(before[6])])
     assert np.subtract(after[:2], before[:2]) == pytest.approx(step, abs=1e-6)
     assert labels.state()["seq"] == actions + 1
     page.keyboard.press("Shift+ArrowLeft")
-    labels.wait(page, number, lambda t: boxes_of(t)[0] != after)
+    labels.wait(page, number, lambda t: get_boxes(t)[0] != after)
     assert wrap_angle(labels.box(number)[6] - before[6]) == pytest.approx(math.radians(1))
 
 
-def test_input_belongs_to_the_track_and_frame_where_it_began(page, labels, person):
-    other, number = labels.chosen(page, person), labels.chosen(page, person)
+def test_input_applies_to_the_track_and_frame_where_it_began(page, labels, person):
+    other, number = labels.add_track(page, person), labels.add_track(page, person)
     labels.wait(page, other, lambda t: t is not None)
     page.click("[data-filter=all]")
     before = labels.tracks()
     page.fill("#field-y", "4.5")
     page.click(f"[data-track='{other}']")
-    labels.wait(page, number, lambda t: boxes_of(t)[0][1] == 4.5)
+    labels.wait(page, number, lambda t: get_boxes(t)[0][1] == 4.5)
     assert labels.tracks()[other] == before[other]
     page.keyboard.down("ArrowUp")
     page.keyboard.press(".")
     page.keyboard.up("ArrowUp")
-    labels.wait(page, other, lambda t: boxes_of(t)[0] != boxes_of(before[other])[0])
+    labels.wait(page, other, lambda t: get_boxes(t)[0] != get_boxes(before[other])[0])
     assert labels.lines()[-1]["frame"] == 0
     page.keyboard.press(",")
     page.wait_for_function("() => page.store.frame === 0")
 
 
-def test_pressed_row_is_selected_though_the_list_changes(page, labels, person):
-    other, number = labels.chosen(page, person), labels.chosen(page, person)
+def test_pressed_row_is_selected_even_if_the_list_changes(page, labels, person):
+    other, number = labels.add_track(page, person), labels.add_track(page, person)
     labels.wait(page, other, lambda t: t is not None)
     page.click("[data-filter=all]")
     assert page.evaluate("page.store.selected") == number
@@ -170,9 +170,9 @@ def test_pressed_row_is_selected_though_the_list_changes(page, labels, person):
 
 
 def test_small_drag_moves_no_box_and_space_presses_no_button(page, labels, person):
-    number = labels.chosen(page, person)
+    number = labels.add_track(page, person)
     lines = len(labels.lines())
-    drag(page, middle(page, "[data-view=top] rect.body"), (2, 2))
+    drag(page, get_centre(page, "[data-view=top] rect.body"), (2, 2))
     page.click("[data-do=copy]")  # continues to frame 1
     page.wait_for_function("() => page.store.frame === 1")
     page.keyboard.press("Space")
@@ -184,7 +184,7 @@ def test_small_drag_moves_no_box_and_space_presses_no_button(page, labels, perso
 
 
 def test_undo_and_redo_step_through_every_state(page, labels, person):
-    number = labels.chosen(page, person)
+    number = labels.add_track(page, person)
     states = [labels.tracks()]
     for key in ("Shift+ArrowUp", "g", "1", "v"):
         page.keyboard.press(key)
@@ -200,7 +200,7 @@ def test_undo_and_redo_step_through_every_state(page, labels, person):
 
 
 def test_class_of_a_seed_is_chosen_at_the_click(page, labels, person):
-    number = labels.chosen(page, person)
+    number = labels.add_track(page, person)
     page.keyboard.press("s")
     page.keyboard.press("3")  # class of new tracks, although a track is selected
     name = page.evaluate("page.store.drive.classes[2].name")
@@ -218,10 +218,10 @@ def test_class_of_a_seed_is_chosen_at_the_click(page, labels, person):
     page.keyboard.press("Escape")
 
 
-def test_one_key_rejects_all_undecided_and_one_undoes_it(page, labels, person):
+def test_rejecting_all_undecided_tracks_is_undone_at_once(page, labels, person):
     others = []
     for _ in range(2):
-        others.append(number := labels.chosen(page, person))
+        others.append(number := labels.add_track(page, person))
         page.keyboard.press("u")
         labels.wait(page, number, lambda t: t["state"] == "proposed")
     before, actions = labels.tracks(), labels.state()["seq"]
@@ -236,8 +236,8 @@ def test_one_key_rejects_all_undecided_and_one_undoes_it(page, labels, person):
 
 
 def test_pages_see_each_others_edits(page, browser, labels, person):
-    number = labels.chosen(page, person)
-    with opened(browser, labels.url) as other, opened(browser, labels.url) as third:
+    number = labels.add_track(page, person)
+    with open_page(browser, labels.url) as other, open_page(browser, labels.url) as third:
         page.keyboard.press("3")
         name = page.evaluate("page.store.drive.classes[2].name")
         for each in (other, third):
@@ -248,7 +248,7 @@ def test_pages_see_each_others_edits(page, browser, labels, person):
 
 
 def test_unsaved_edit_is_reported_and_reverted(page, labels, person):
-    number = labels.chosen(page, person)
+    number = labels.add_track(page, person)
     before = labels.tracks()
     page.keyboard.press("x")  # the only frame cannot be trimmed
     page.wait_for_selector("#errors .toast")
@@ -260,7 +260,7 @@ def test_unsaved_edit_is_reported_and_reverted(page, labels, person):
 
 
 def test_export_is_written_and_not_overwritten(page, labels, person):
-    number = labels.chosen(page, person)
+    number = labels.add_track(page, person)
     page.keyboard.press("a")
     labels.wait(page, number, lambda t: t["state"] == "accepted")
     for replace, wrong in ((False, False), (False, True), (True, False)):
@@ -300,27 +300,27 @@ def test_help_lists_the_keys_and_works_without_a_mouse(page):
         assert name, page.evaluate("document.activeElement.outerHTML.slice(0, 200)")
 
 
-def test_killed_server_loses_nothing(page, browser, labels, person):
-    number = labels.chosen(page, person)
-    drag(page, middle(page, "[data-view=top] rect.body"), (10, 20))
+def test_killed_server_loses_no_saved_labels(page, browser, labels, person):
+    number = labels.add_track(page, person)
+    drag(page, get_centre(page, "[data-view=top] rect.body"), (10, 20))
     page.wait_for_function("() => page.store.draft === null")
     before = labels.tracks()
     labels.process.kill()
     page.wait_for_selector("#lost", state="visible")
     page.keyboard.press("r")
     page.wait_for_selector("#errors .toast")  # not saved, and reported
-    with serving(*labels.arguments) as server:
+    with run_server(*labels.arguments) as server:
         labels.process, labels.url = server.process, server.url
         assert labels.tracks() == before and before[number]["state"] != "rejected"
-        with opened(browser, server.url) as again:
+        with open_page(browser, server.url) as again:
             assert again.evaluate("n => page.store.tracks.has(n)", number)
         page.wait_for_function(
             "() => document.getElementById('lost').textContent.includes('address')"
         )  # it has a new token now
 
 
-def test_view_shows_labels_and_refuses_actions(browser, drive_bag):
-    with serving("view", drive_bag, "--no-open") as shown, opened(browser, shown.url) as page:
+def test_view_shows_labels_and_rejects_actions(browser, drive_bag):
+    with run_server("view", drive_bag, "--no-open") as shown, open_page(browser, shown.url) as page:
         truth = next(iter(open_recording(drive_bag))).truth()
         assert page.evaluate("page.store.results.labels.length") == len(truth)
         assert page.locator("#accept").is_hidden() and page.locator("#export").is_hidden()
@@ -333,10 +333,13 @@ def test_view_shows_labels_and_refuses_actions(browser, drive_bag):
         assert "label" in reply["error"]
 
 
-def test_view_selects_labels_and_keys_step_through_missed_ones(browser, drive_bag, tmp_path):
+def test_view_steps_through_misses_by_key(browser, drive_bag, tmp_path):
     results = tmp_path / "nothing"  # no detections in any frame
     results.mkdir()
-    with serving("view", drive_bag, "--results", results, "--no-open") as shown, opened(browser, shown.url) as page:
+    with (
+        run_server("view", drive_bag, "--results", results, "--no-open") as shown,
+        open_page(browser, shown.url) as page,
+    ):
         missed = page.evaluate("page.store.results.matches.nothing.missed")
         counts = page.evaluate("[...document.querySelectorAll('#counts b')].map(b => Number(b.textContent))")
         assert counts[0] == sum(counts[1:4]) > counts[2] == len(missed) > 0

@@ -6,13 +6,13 @@ import json
 import math
 
 import pytest
-from labeling_pages import boxes_of, opened
+from labeling_pages import get_boxes, open_page
 
 pytestmark = pytest.mark.no_cover  # covered by other tests
 
 
 def test_typed_number_changes_one_value_and_escape_cancels(page, labels, person):
-    number = labels.chosen(page, person)
+    number = labels.add_track(page, person)
     page.click("[data-filter=all]")
     before, lines = labels.box(number), len(labels.lines())
     for key, text, there in (
@@ -26,7 +26,7 @@ def test_typed_number_changes_one_value_and_escape_cancels(page, labels, person)
         page.keyboard.press("Delete")
         page.keyboard.type(text)
         page.keyboard.press(key)
-        labels.wait(page, number, lambda t, y=there[1]: boxes_of(t)[0][1] == y)
+        labels.wait(page, number, lambda t, y=there[1]: get_boxes(t)[0][1] == y)
         page.wait_for_function("y => document.getElementById('field-y').value === y", arg=f"{there[1]:.2f}")
     page.click("#errors .toast button")  # the refusal was reported
     assert labels.box(number) == [before[0], 4.567, *before[2:]]
@@ -36,13 +36,13 @@ def test_typed_number_changes_one_value_and_escape_cancels(page, labels, person)
         page.keyboard.press("Control+a")
         page.keyboard.type(text)
         page.keyboard.press("Tab")
-    labels.wait(page, number, lambda t: boxes_of(t)[0][:2] == [3.25, 2.125])
+    labels.wait(page, number, lambda t: get_boxes(t)[0][:2] == [3.25, 2.125])
 
 
 def test_keys_while_a_frame_loads_apply_to_the_shown_one(browser, page, labels, person):
-    number = labels.chosen(page, person)
+    number = labels.add_track(page, person)
     before, held = labels.box(number), []
-    with opened(browser, f"{labels.url}&track={number}") as other:
+    with open_page(browser, f"{labels.url}&track={number}") as other:
         other.route("**/api/cloud/7*", lambda route: held.append(route))
         other.keyboard.press("End")
         other.keyboard.down("ArrowUp")
@@ -52,12 +52,12 @@ def test_keys_while_a_frame_loads_apply_to_the_shown_one(browser, page, labels, 
         held.pop().continue_()
         other.wait_for_function("() => page.store.frame === 7")
         other.keyboard.up("ArrowUp")
-        labels.wait(other, number, lambda t: boxes_of(t)[0] != before)
+        labels.wait(other, number, lambda t: get_boxes(t)[0] != before)
     assert math.dist(labels.box(number)[:2], before[:2]) == pytest.approx(0.05)
 
 
 def test_each_frame_is_checked_once_at_any_key_speed(browser, page, labels):
-    with opened(browser, labels.url) as other:
+    with open_page(browser, labels.url) as other:
         held = []
         other.route("**/api/cloud/4*", lambda route: held.append(route))
         for _ in range(3):
@@ -78,8 +78,8 @@ def test_each_frame_is_checked_once_at_any_key_speed(browser, page, labels):
         other.wait_for_function("() => page.store.checked.size === 0")
 
 
-def test_arrow_moves_the_box_after_a_class_was_chosen_by_mouse(page, labels, person):
-    number = labels.chosen(page, person)
+def test_arrow_key_moves_the_box_after_a_class_is_chosen_by_mouse(page, labels, person):
+    number = labels.add_track(page, person)
     before = labels.box(number)
     page.click("#class")
     for key in "ArrowDown", "Enter":  # in the opened list
@@ -87,7 +87,7 @@ def test_arrow_moves_the_box_after_a_class_was_chosen_by_mouse(page, labels, per
     labels.wait(page, number, lambda t: t["class"] != "Pedestrian")
     chosen = labels.tracks()[number]["class"]
     page.keyboard.press("ArrowUp")
-    labels.wait(page, number, lambda t: boxes_of(t)[0] != before)
+    labels.wait(page, number, lambda t: get_boxes(t)[0] != before)
     assert labels.tracks()[number]["class"] == chosen
     page.route("**/api/do*", lambda route: route.abort())
     page.select_option("#class", "Car")
@@ -98,7 +98,7 @@ def test_arrow_moves_the_box_after_a_class_was_chosen_by_mouse(page, labels, per
 
 
 def test_outdated_server_state_reverts_nothing(browser, page, labels, person):
-    number, states = labels.chosen(page, person), []
+    number, states = labels.add_track(page, person), []
 
     def reply(route):
         states.append((route, route.fetch()))
@@ -108,7 +108,7 @@ def test_outdated_server_state_reverts_nothing(browser, page, labels, person):
     def held(page):
         page.route("**/api/state*", reply)
 
-    with opened(browser, labels.url, held) as other:
+    with open_page(browser, labels.url, held) as other:
         while len(states) < 2:  # one when the page opens, one when it subscribes
             other.wait_for_timeout(10)
         page.keyboard.press("3")
@@ -124,7 +124,7 @@ def test_outdated_server_state_reverts_nothing(browser, page, labels, person):
 
 def test_browser_confirms_leaving_with_unsaved_actions(browser, labels):
     held, requests = [], []
-    with opened(browser, labels.url) as other:
+    with open_page(browser, labels.url) as other:
         other.route("**/api/do*", lambda route: held.append(route))
         other.on("dialog", lambda dialog: (requests.append(dialog.type), dialog.dismiss()))
         other.keyboard.press("k")
@@ -140,7 +140,7 @@ def test_browser_confirms_leaving_with_unsaved_actions(browser, labels):
 
 
 def test_export_waits_for_actions_that_are_saved_slowly(page, labels, person):
-    number, held = labels.chosen(page, person), []
+    number, held = labels.add_track(page, person), []
     before = labels.box(number)
     page.route("**/api/do*", lambda route: held.append(route))
     page.keyboard.press("Shift+ArrowUp")
@@ -162,7 +162,7 @@ def test_saved_action_without_event_is_not_reported_as_lost(browser, labels):
         page.add_init_script("WebSocket = class {}")
 
     lines = len(labels.lines())
-    with opened(browser, labels.url, deaf) as other:
+    with open_page(browser, labels.url, deaf) as other:
         other.route("**/api/state*", lambda route: route.abort())
         other.keyboard.press("k")
         other.wait_for_function("() => page.store.frame === 1")

@@ -44,16 +44,16 @@ class Server:
 
 
 @contextmanager
-def serving(*arguments: object, before: Callable[[], None] = lambda: None) -> Iterator[Server]:
+def run_server(*arguments: object, before: Callable[[], None] = lambda: None) -> Iterator[Server]:
     """Run label or view in a fork of this process, which has loaded all modules.
     before: called first in the fork."""
-    (out, said), (errors, wrong) = os.pipe(), os.pipe()
+    (out, out_end), (errors, errors_end) = os.pipe(), os.pipe()
     process = multiprocessing.get_context("fork").Process(
-        target=_command, args=([str(a) for a in arguments], said, wrong, before)
+        target=_run_command, args=([str(a) for a in arguments], out_end, errors_end, before)
     )
     process.start()
-    os.close(said)
-    os.close(wrong)
+    os.close(out_end)
+    os.close(errors_end)
     with open(out) as lines, open(errors) as problems:
         try:
             url = lines.readline().strip()
@@ -64,9 +64,9 @@ def serving(*arguments: object, before: Callable[[], None] = lambda: None) -> It
             process.join()
 
 
-def _command(arguments: list[str], said: int, wrong: int, before: Callable[[], None]) -> None:
+def _run_command(arguments: list[str], out_end: int, errors_end: int, before: Callable[[], None]) -> None:
     sys.argv = ["lidar-perception", *arguments]
-    sys.stdout, sys.stderr = open(said, "w", 1), open(wrong, "w", 1)
+    sys.stdout, sys.stderr = open(out_end, "w", 1), open(errors_end, "w", 1)
     before()
     main()
 
@@ -90,7 +90,7 @@ class Label:
 
     def box(self, number: int) -> list[float]:
         """Return the box of a track in frame 0."""
-        return boxes_of(self.tracks()[number])[0]
+        return get_boxes(self.tracks()[number])[0]
 
     def lines(self) -> list[dict]:
         """Return the lines of the journal."""
@@ -117,19 +117,19 @@ class Label:
         page.keyboard.press("Escape")
         return page.evaluate("page.store.selected")
 
-    def chosen(self, page, person: np.ndarray) -> int:
+    def add_track(self, page, person: np.ndarray) -> int:
         """Create and select a new track of a person; decisions do not move on to the next track."""
         number = self.seed(page, person)
         page.uncheck("#advance")
         page.locator("#scene").focus()
         page.keyboard.press("f")
-        drawn(page)
+        wait_until_drawn(page)
         return number
 
-    def wait(self, page, number: int, true) -> None:
+    def wait(self, page, number: int, condition) -> None:
         """Wait until a condition holds for a track, on the server and on the page."""
         end = monotonic() + PATIENCE
-        while not true(self.tracks().get(number)):
+        while not condition(self.tracks().get(number)):
             assert monotonic() < end, (self.tracks().get(number), self.lines()[-3:])
             sleep(0.02)
         page.wait_for_function("n => page.store.seq >= n", arg=self.state()["seq"])
@@ -137,16 +137,16 @@ class Label:
 
 
 @contextmanager
-def opened(browser, url: str, before: Callable = lambda page: None) -> Iterator:
+def open_page(browser, url: str, before: Callable = lambda page: None) -> Iterator:
     """Open an address in a new page. before: called with the page first."""
     context = browser.new_context(viewport={"width": 1280, "height": 720})
-    page, wrong = context.new_page(), []
+    page, problems = context.new_page(), []
     page.set_default_timeout(60_000)
-    page.on("pageerror", lambda error: wrong.append(error))
+    page.on("pageerror", lambda error: problems.append(error))
     page.on(
         "request",
         lambda r: (
-            wrong.append(r.url) if "127.0.0.1" not in r.url and not r.url.startswith(("data:", "blob:")) else None
+            problems.append(r.url) if "127.0.0.1" not in r.url and not r.url.startswith(("data:", "blob:")) else None
         ),
     )
     before(page)
@@ -154,14 +154,14 @@ def opened(browser, url: str, before: Callable = lambda page: None) -> Iterator:
     page.wait_for_selector("html[data-ready=true]", state="attached")
     yield page
     context.close()
-    assert wrong == []
+    assert problems == []
 
 
-def boxes_of(track: dict) -> dict[int, list[float]]:
+def get_boxes(track: dict) -> dict[int, list[float]]:
     return {row[0]: row[1:8] for row in track["boxes"]}
 
 
-def faces(box: list[float]) -> dict[str, float]:
+def get_face_positions(box: list[float]) -> dict[str, float]:
     """Return the distance of each face from the origin along its outward axis."""
     x, y, z, *size, yaw = box
     cos, sin = math.cos(yaw), math.sin(yaw)
@@ -173,20 +173,20 @@ def faces(box: list[float]) -> dict[str, float]:
     }
 
 
-def drawn(page) -> None:
+def wait_until_drawn(page) -> None:
     """Wait until the current state of the page is drawn."""
     page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
 
-def middle(page, selector: str) -> tuple[float, float]:
+def get_centre(page, selector: str) -> tuple[float, float]:
     """Return the centre of an element in page pixels."""
-    drawn(page)
+    wait_until_drawn(page)
     area = page.locator(selector).bounding_box()
     return area["x"] + area["width"] / 2, area["y"] + area["height"] / 2
 
 
-def drag(page, start: tuple[float, float], way: tuple[float, float]) -> None:
+def drag(page, start: tuple[float, float], offset: tuple[float, float]) -> None:
     page.mouse.move(*start)
     page.mouse.down()
-    page.mouse.move(start[0] + way[0], start[1] + way[1], steps=5)
+    page.mouse.move(start[0] + offset[0], start[1] + offset[1], steps=5)
     page.mouse.up()
