@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import Field, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import click
 
 from lidar_perception.candidates.configurations import CONFIGURATIONS, PAPER
 from lidar_perception.cli.command import Choice, HelpfulOption
-from lidar_perception.cli.parameter_files import Fields, read_parameters
+from lidar_perception.cli.parameter_files import Fields, parse_value, read_parameters
 from lidar_perception.detectors.contract import FUSED
 from lidar_perception.detectors.open import DetectorChoice, make_default_params
 from lidar_perception.detectors.params import RANGE_CHOICES
@@ -30,7 +30,6 @@ from lidar_perception.types import InputError, suggest_name
 
 CANDIDATES = "candidates"
 CANDIDATE_NODES = "perception", "ground_segmentation", "clustering", "candidate_refinement"
-ON_OFF = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ class Settings:
             {
                 **values,
                 **{
-                    name: _parse(name, algorithm.fields[name], text)
+                    name: parse_value(name, algorithm.fields[name], text)
                     for name, text in self.assignments
                     if name in algorithm.fields
                 },
@@ -101,27 +100,6 @@ def _suggest_parameter(name: str, fields: Fields) -> str:
         return f", which is a group with {', '.join(members)}"
     matches = [key for key in fields if key.endswith(f".{name}")]
     return f"; did you mean {matches[0]!r}?" if len(matches) == 1 else suggest_name(name, fields)
-
-
-def _parse(name: str, f: Field[Any], text: str) -> Any:
-    """Convert the text of a parameter to its type."""
-    value_type = f.metadata["item"] or type(f.default)
-    try:
-        if not isinstance(f.default, tuple):
-            return _parse_scalar(value_type, text)
-        items = text.strip().removeprefix("[").removesuffix("]")
-        return tuple(_parse_scalar(value_type, word.strip()) for word in items.split(",") if word.strip())
-    except (ValueError, KeyError):
-        expected = (
-            "a list of numbers, e.g. 0.15,0.3"
-            if isinstance(f.default, tuple)
-            else {bool: "true or false", int: "a whole number", float: "a number"}[value_type]
-        )
-        raise InputError(f"--set {name}={text[:80]}: the value must be {expected}") from None
-
-
-def _parse_scalar(value_type: type, text: str) -> Any:
-    return ON_OFF[text.lower()] if value_type is bool else value_type(text)
 
 
 class Assignment(click.ParamType):

@@ -17,6 +17,7 @@ from lidar_perception.runs.files import read_text, shorten_error
 from lidar_perception.types import InputError, list_valid_names, suggest_name
 
 MAX_BYTES, MAX_NAMES = 10**6, 10_000  # limits of a parameter file; YAML aliases turn few bytes into many names
+ON_OFF = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
 MAX_DEPTH = 20  # maximum nesting of groups
 
 Fields = Mapping[str, Field[Any]]
@@ -113,3 +114,28 @@ def _iterate_dotted(
             yield from _iterate_dotted(path, value, visited, f"{prefix}{key}.", depth + 1)
         else:
             yield f"{prefix}{key}", value
+
+
+def parse_value(name: str, f: Field[Any], text: str) -> Any:
+    """Convert the text of a parameter to its type.
+
+    Raises:
+        InputError: The text has another type.
+    """
+    value_type = f.metadata["item"] or type(f.default)
+    try:
+        if not isinstance(f.default, tuple):
+            return _parse_scalar(value_type, text)
+        items = text.strip().removeprefix("[").removesuffix("]")
+        return tuple(_parse_scalar(value_type, word.strip()) for word in items.split(",") if word.strip())
+    except (ValueError, KeyError):
+        expected = (
+            "a list of numbers, e.g. 0.15,0.3"
+            if isinstance(f.default, tuple)
+            else {bool: "true or false", int: "a whole number", float: "a number"}[value_type]
+        )
+        raise InputError(f"--set {name}={text[:80]}: the value must be {expected}") from None
+
+
+def _parse_scalar(value_type: type, text: str) -> Any:
+    return ON_OFF[text.lower()] if value_type is bool else value_type(text)

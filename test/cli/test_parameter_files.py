@@ -192,7 +192,7 @@ def test_detector_settings_take_effect_and_precedence():
     detector = made.open(sensor_height=1.0, min_score=0.001)
     assert detector.min_scores == {"Car": 0.7, "Pedestrian": 0.001, "Cyclist": 0.001}
     assert detector.range == "around" and detector.params.ground.sensor_pose.height == 1.0
-    with pytest.raises(InputError, match="give one of them"):
+    with pytest.raises(InputError, match="give only one of them"):
         DetectorChoice("f.json", settings={"fused.weights": "a"}).open()
 
 
