@@ -67,7 +67,7 @@ def test_wait_for_another_process_is_reported(report_all, tmp_path, monkeypatch)
 def test_empty_cache_is_reported_before_anything_is_compiled(cached, monkeypatch):
     monkeypatch.setattr(compiling, "_is_cached", lambda: cached)
     lines = []
-    with report_compilation(lines.append), report_compilation(whole_detector=True):
+    with report_compilation(lines.append), report_compilation(full_detector=True):
         assert lines == [compiling.COMPILING_MESSAGE] * (not cached)
 
 

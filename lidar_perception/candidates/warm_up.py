@@ -28,7 +28,7 @@ from lidar_perception.wire.params import ViewParams
 CAMERA = Camera(np.array([[50, -100, 0, 0], [50, 0, -100, 0], [1, 0, 0, 0]], float), 100, 100)
 
 
-@report_compilation(whole_detector=True)
+@report_compilation(full_detector=True)
 def warm_up() -> None:
     """Run every stage and method once on synthetic points to trigger JIT compilation."""
     for ground, clustering, boxes, with_confidence in (

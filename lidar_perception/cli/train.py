@@ -190,7 +190,7 @@ def fused(
     if out.suffix != SUFFIX:
         raise InputError(f"--out {out} must end with {SUFFIX}")
     if out.exists() and not force:
-        raise InputError(f"{out} exists already; give another name, or --force")
+        raise InputError(f"{out} already exists; give another name, or --force")
     from lidar_perception.training.fusion_curves import fit_fusion
 
     for kind, fits in fit_fusion(weights, classifier, out, params, jobs).items():

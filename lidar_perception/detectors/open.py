@@ -54,7 +54,7 @@ class ConfigurableDetector(Detector, Protocol):
         """Return a copy of this detector with a different range, see base.NetworkDetector."""
 
 
-@report_compilation(whole_detector=True)
+@report_compilation(full_detector=True)
 def open_detector(
     weights: str | Path = FUSED,
     device: str = "auto",

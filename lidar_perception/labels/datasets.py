@@ -1,4 +1,4 @@
-"""Conversion of recordings to data sets; content that a layout cannot store is reported."""
+"""Conversion of recordings to data sets, with a report of content that the layout cannot store."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from lidar_perception.data.open import write_height
 from lidar_perception.labels.datasets_nuscenes import NuscenesTables
 from lidar_perception.labels.drive_labels import NO_TRACK, DriveLabels, FrameLabels, read_frame_labels
 from lidar_perception.labels.formats import kitti_object, kitti_tracking
-from lidar_perception.labels.formats.nuscenes import SIMILAR_NAMES
+from lidar_perception.labels.formats.nuscenes import SIMILAR_NAME_BY_CLASS
 from lidar_perception.labels.names import resolve_format
 from lidar_perception.runs.files import write_bytes, write_folder
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.types import SENSOR_HEIGHT, InputError
 
-# Camera for a recording without one: level, at the LiDAR, with KITTI's field of view.
+# Camera assumed for a recording without one: level, at the LiDAR, with KITTI's field of view.
 ASSUMED_CAMERA = replace(
     FORWARD_CAMERA, lidar_to_camera=np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 )
@@ -34,8 +34,8 @@ class DatasetFrame:
     """Frame with its labels and its position in the data set.
 
     Attributes:
-        frame: The frame.
-        labels: Its labels.
+        frame: Frame of the recording.
+        labels: Labels of the frame.
         drive: Number of the drive.
         index: Number of the frame in the drive.
         number: Number of the frame in the data set.
@@ -50,10 +50,13 @@ class DatasetFrame:
 
 @dataclass
 class Summary:
-    """Counts of frames, boxes and drives of a data set.
+    """Counts of a data set.
 
     Attributes:
-        remarks: Number of frames for each omission or assumption.
+        frames: Number of frames.
+        boxes: Number of boxes.
+        drives: Number of drives.
+        remarks: Number of frames to which each omission or assumption applies.
     """
 
     frames: int = 0
@@ -62,7 +65,7 @@ class Summary:
     remarks: dict[str, int] = field(default_factory=dict)
 
     def add_remark(self, text: str) -> None:
-        """Add one frame to the count of a remark."""
+        """Increment the count of a remark."""
         self.remarks[text] = self.remarks.get(text, 0) + 1
 
 
@@ -72,7 +75,7 @@ def write_dataset(
     """Write the frames of a recording as a data set in one of LAYOUTS.
 
     Frames are numbered from 0; in KITTI's tracking layout the number is the time in units of 0.1 s.
-    A new drive starts at a new sequence of the recording, after a gap of 5 s, and when the
+    A new drive starts at each sequence of the recording, after a gap of 5 s, and when the
     calibration changes. A sensor height that differs from KITTI's is stored, see
     data.open.write_height.
 
@@ -96,7 +99,7 @@ def write_dataset(
             summary.boxes += len(item.labels)
             summary.drives = item.drive + 1
         if summary.frames == 0:
-            raise InputError("there are no frames to write; give a recording with clouds")
+            raise InputError("the recording has no frames; give a recording with clouds")
     return summary
 
 
@@ -129,7 +132,7 @@ def _ensure_camera(frame: Frame, summary: Summary) -> tuple[Frame, Calibration]:
     """Return the frame and its calibration; if it has none, both use ASSUMED_CAMERA."""
     calibration = frame.calibration()
     if calibration is None:
-        summary.add_remark("assumed: a camera at the LiDAR facing ahead, which KITTI's labels need")
+        summary.add_remark("assumed: a forward camera at the LiDAR, because KITTI's labels need a camera")
         calibration = ASSUMED_CAMERA
     return replace(frame, calibration=lambda: calibration), calibration
 
@@ -137,12 +140,12 @@ def _ensure_camera(frame: Frame, summary: Summary) -> tuple[Frame, Calibration]:
 def _load_cloud(frame: Frame, summary: Summary) -> np.ndarray:
     scan = frame.load()
     if scan.intensity is None:
-        summary.add_remark("assumed: an intensity of 0, as the clouds have none")
+        summary.add_remark("assumed: an intensity of 0, because the clouds have none")
     return scan.points()
 
 
-def _remark_losses(summary: Summary, item: DatasetFrame, storable: str) -> None:
-    """Add a remark for each kind of content of the frame that is not in `storable`."""
+def _add_loss_remarks(summary: Summary, item: DatasetFrame, stored_content: str) -> None:
+    """Add a remark for each kind of content of the frame that is not in `stored_content`."""
     labels = item.labels
     for content, exists in (
         ("poses", item.frame.pose() is not None),
@@ -150,7 +153,7 @@ def _remark_losses(summary: Summary, item: DatasetFrame, storable: str) -> None:
         ("boxes", len(labels) > 0),
         ("track ids", bool((labels.track_ids != NO_TRACK).any())),
     ):
-        if exists and content not in storable:
+        if exists and content not in stored_content:
             summary.add_remark(f"left out: {content}, which the layout cannot store")
 
 
@@ -160,7 +163,7 @@ def _write_kitti_object(folder: Path, frames: Iterator[DatasetFrame], summary: S
         write_object_text(
             folder, item.number, _load_cloud(frame, summary), kitti_object.format_frame(item.labels, frame), calibration
         )
-        _remark_losses(summary, item, "boxes")
+        _add_loss_remarks(summary, item, "boxes")
         yield item
 
 
@@ -174,9 +177,9 @@ def _write_kitti_tracking(folder: Path, frames: Iterator[DatasetFrame], summary:
         if name not in texts:
             write_bytes(root / f"calib/{name}.txt", format_calibration(calibration).encode())
         texts.setdefault(name, []).append(kitti_tracking.format_frame(item.labels, frame, item.index))
-        _remark_losses(summary, item, "boxes, track ids")
+        _add_loss_remarks(summary, item, "boxes, track ids")
         if (item.labels.track_ids == NO_TRACK).any():
-            summary.add_remark("without a track id: boxes, written with the id -1")
+            summary.add_remark("boxes without a track id: written with the id -1")
         yield item
     for name, parts in texts.items():
         write_bytes(root / f"label_02/{name}.txt", "".join(parts).encode())
@@ -199,7 +202,7 @@ def _write_semantickitti(folder: Path, frames: Iterator[DatasetFrame], summary: 
             points.classes,
             points.instances,
         )
-        _remark_losses(summary, item, "point labels, poses")
+        _add_loss_remarks(summary, item, "point labels, poses")
         scans.append((frame.stamp_ns, frame.calibration() or ASSUMED_CAMERA, frame.pose()))
         yield item
     for drive, rows in drives.items():
@@ -215,7 +218,7 @@ def _write_semantickitti(folder: Path, frames: Iterator[DatasetFrame], summary: 
                 "".join(semantickitti.format_pose(to_first @ pose, calibration) for pose in poses).encode(),
             )
         elif poses:
-            summary.add_remark("left out: poses, as some frames of the drive have none")
+            summary.add_remark("left out: poses, because some frames of the drive have none")
 
 
 def _write_nuscenes(folder: Path, frames: Iterator[DatasetFrame], summary: Summary) -> Iterator[DatasetFrame]:
@@ -223,11 +226,11 @@ def _write_nuscenes(folder: Path, frames: Iterator[DatasetFrame], summary: Summa
     for item in frames:
         frame, labels = item.frame, item.labels
         if frame.pose() is None:
-            summary.add_remark("assumed: a vehicle that does not move, as there are no poses")
-        for name in sorted(set(labels.class_names) & SIMILAR_NAMES.keys()):
-            summary.add_remark(f"written as another class: {name} as {SIMILAR_NAMES[name]}")
+            summary.add_remark("assumed: a vehicle that does not move, because the recording has no poses")
+        for name in sorted(set(labels.class_names) & SIMILAR_NAME_BY_CLASS.keys()):
+            summary.add_remark(f"written as another class: {name} as {SIMILAR_NAME_BY_CLASS[name]}")
         tables.add(frame, labels, item.drive, _load_cloud(frame, summary))
-        _remark_losses(summary, item, "boxes, poses, track ids")
+        _add_loss_remarks(summary, item, "boxes, poses, track ids")
         yield item
     tables.write()
 

@@ -29,7 +29,12 @@ from lidar_perception.data.nuscenes.folder import FULL_REFLECTION, LIDAR_CHANNEL
 from lidar_perception.data.nuscenes.results import format_boxes
 from lidar_perception.geometry import points_in_boxes
 from lidar_perception.labels.drive_labels import NO_TRACK, FrameLabels
-from lidar_perception.labels.formats.nuscenes import OUR_NAMES, RIDDEN_CLASSES, WRITTEN_NAMES, find_read_rotation
+from lidar_perception.labels.formats.nuscenes import (
+    CLASS_BY_NUSCENES_NAME,
+    RIDDEN_CLASSES,
+    WRITTEN_NAME_BY_CLASS,
+    find_original_rotation,
+)
 from lidar_perception.runs.files import write_bytes, write_text
 
 VERSION = "v1.0-trainval"
@@ -51,7 +56,7 @@ TABLES = (
     "sample_annotation",
     "map",
 )
-MAP = "maps/none.png"  # required by nuscenes-devkit
+MAP = "maps/none.png"  # path of an empty map, which nuscenes-devkit requires
 
 
 def make_token(*parts: object) -> str:
@@ -60,7 +65,7 @@ def make_token(*parts: object) -> str:
 
 
 class NuscenesTables:
-    """Tables of a data set; add() adds one frame, write() writes the files."""
+    """Writer of the tables of a data set. Call add() for each frame, then write()."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -80,10 +85,16 @@ class NuscenesTables:
         self.rows["attribute"] = [{"token": make_token(a), "name": a, "description": ""} for a in ATTRIBUTES]
         self.categories: dict[str, str] = {}
         self.instances: dict[str, dict[str, Any]] = {}
-        self.last_rows: dict[str, dict[str, Any]] = {}  # of each chain, see _add_linked
+        self.last_rows: dict[str, dict[str, Any]] = {}  # TABLE/CHAIN -> last row added, see _add_linked
 
     def add(self, frame: Frame, labels: FrameLabels, drive: int, cloud: np.ndarray) -> None:
-        """Add a scan (N, 4) [x y z intensity] with its labels and write its sweep.
+        """Add a frame to the tables, and write its sweep.
+
+        Args:
+            frame: Frame of the recording.
+            labels: Labels of the frame.
+            drive: Number of the drive.
+            cloud: (N, 4) [x y z intensity].
 
         Raises:
             InputError: The sweep cannot be written, or the frame cannot be read.
@@ -91,7 +102,7 @@ class NuscenesTables:
         scene = f"scene-{drive + 1:04}"
         sample = make_token(scene, len(self.rows["sample"]))
         file = f"samples/{LIDAR_CHANNEL}/{scene}__{LIDAR_CHANNEL}__{frame.stamp_ns // 1000}.pcd.bin"
-        if (self.folder / file).exists():  # some drivers give two scans the same stamp
+        if (self.folder / file).exists():  # some drivers write two scans with the same stamp
             file = file.replace(".pcd.bin", f"-{len(self.rows['sample'])}.pcd.bin")
         self._write_sweep(self.folder / file, cloud)
         pose = frame.pose()
@@ -159,17 +170,19 @@ class NuscenesTables:
         for k, placement in enumerate(placements):
             track, name, extra = labels.track_ids[k], labels.class_names[k], labels.extra[k]
             lidar, radar = int(point_counts[k]), 0
-            if rotation := find_read_rotation(labels, k, pose):  # the box is unchanged
+            if rotation := find_original_rotation(labels, k, pose):  # true if the box is unchanged
                 placement["rotation"] = rotation
                 lidar = extra.get("lidar_points", lidar)
                 radar = extra.get("points", lidar) - lidar
             instance = make_token(scene, "track", track) if track != NO_TRACK else make_token(sample, k)
-            written_name = WRITTEN_NAMES.get(name, name)
+            written_name = WRITTEN_NAME_BY_CLASS.get(name, name)
             category = extra.get("category")
             if CATEGORIES.get(str(category), category) != written_name:
                 category = CATEGORY_BY_NAME.get(written_name, name)
             attribute = extra.get("attribute") or (
-                ATTRIBUTES[WITH_RIDER] if name in OUR_NAMES.values() and written_name in RIDDEN_CLASSES else None
+                ATTRIBUTES[WITH_RIDER]
+                if name in CLASS_BY_NUSCENES_NAME.values() and written_name in RIDDEN_CLASSES
+                else None
             )
             if instance not in self.instances:
                 self._add(
@@ -208,7 +221,7 @@ class NuscenesTables:
         self.rows[table].append({"token": token, **values})
 
     def _add_linked(self, table: str, chain: str, token: str, /, **values: Any) -> None:
-        """Add a row, and link it with the previous row of its chain."""
+        """Add a row, and link it with the previous row of its chain (scene or instance)."""
         previous = self.last_rows.get(f"{table}/{chain}")
         self._add(table, token, **values, prev=previous["token"] if previous else "", next="")
         if previous is not None:

@@ -1,4 +1,4 @@
-"""Labels of a drive and of its frames, independent of the file format."""
+"""Labels of drives and frames, independent of the file format."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lidar_perception.types import CLASSES, MAX_RANGE, GroundTruth, InputError, 
 
 NO_TRACK = -1
 OTHER_CLASS = "Misc"  # one of CLASSES, used for unknown classes
-MAX_DIFFERENCE = 1e-4  # tolerance in metres and radians between a box and the one that was read
+MAX_DIFFERENCE = 1e-4  # difference in metres and radians from the box in the file below which a box is unchanged
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,10 +27,10 @@ class FrameLabels:
         stamp_ns: Stamp of the frame.
         boxes: (K, 7) float64 [x y z l w h yaw], metres and radians.
         class_names: K class names, which may be any text.
-        track_ids: (K,) int64, -1 for none.
-        scores: (K,) float64, NaN for none.
+        track_ids: (K,) int64, -1 for boxes without a track.
+        scores: (K,) float64, NaN for boxes without a score.
         extra: K JSON objects with additional fields of the format.
-        notes: (class, JSON object) of each object without a 3D box, such as KITTI's DontCare
+        notes: (class name, JSON object) of each object without a 3D box, such as KITTI's DontCare
             regions.
     """
 
@@ -53,16 +53,18 @@ class FrameLabels:
         scores: ArrayLike | None = None,
         extra: Iterable[dict[str, Any]] | None = None,
         notes: Iterable[tuple[str, dict[str, Any]]] = (),
-        where: object = None,
+        source: object = None,
     ) -> FrameLabels:
         """Make labels and convert dtypes and shapes.
 
+        Args:
+            source: Start of error messages, such as the name of the file.
+
         Raises:
             InputError: A box is not finite, is beyond MAX_RANGE or has a side that is not positive;
-                a track id is not an integer; or the columns differ in length. The message starts
-                with `where`.
+                a track id is not an integer; or the columns differ in length.
         """
-        where = where or f"the labels of frame {name}"
+        source = source or f"the labels of frame {name}"
         try:
             boxes = np.array(boxes, np.float64).reshape(-1, 7)
             count = len(boxes)
@@ -80,12 +82,12 @@ class FrameLabels:
             )
         except (ValueError, TypeError, OverflowError) as error:
             raise InputError(
-                f"{where}: a box is malformed ({error}); it needs seven numbers, a "
+                f"{source}: a box is malformed ({error}); expected seven numbers, a "
                 "class and, optionally, an integer track id"
             ) from None
         if not len(labels.class_names) == len(labels.extra) == count:
             raise InputError(
-                f"{where}: {count} boxes, {len(labels.class_names)} classes and "
+                f"{source}: {count} boxes, but {len(labels.class_names)} classes and "
                 f"{len(labels.extra)} extras; each box needs one of each"
             )
         is_invalid = ~(
@@ -93,12 +95,12 @@ class FrameLabels:
         )
         if is_invalid.any():
             raise InputError(
-                f"{where}, box {np.flatnonzero(is_invalid)[0] + 1} of {count}: its "
-                f"numbers must be finite and within {MAX_RANGE:g} m, its sides above "
-                "0; correct or remove it"
+                f"{source}, box {np.flatnonzero(is_invalid)[0] + 1} of {count}: its "
+                f"numbers must be finite and within {MAX_RANGE:g} m, and its sides positive; "
+                "correct or remove it"
             )
         if np.isinf(labels.scores).any():
-            raise InputError(f"{where}: a score is not finite; correct or remove it")
+            raise InputError(f"{source}: a score is not finite; correct or remove it")
         return labels
 
     def __len__(self) -> int:
@@ -111,7 +113,7 @@ class DriveLabels:
 
     Attributes:
         frames: Labels of each frame, in the order of the frames.
-        extra: JSON object with the content of a file that belongs to the drive, by format.
+        extra: Content of files that belongs to the drive and not to a frame, by format.
     """
 
     frames: list[FrameLabels]
@@ -134,16 +136,16 @@ Row = tuple[Sequence[float], str, int, float, dict[str, Any]]  # (box, class, tr
 
 
 def make_frame_labels(
-    frame: Frame, rows: Iterable[Row], notes: Iterable[tuple[str, dict[str, Any]]] = (), where: object = None
+    frame: Frame, rows: Iterable[Row], notes: Iterable[tuple[str, dict[str, Any]]] = (), source: object = None
 ) -> FrameLabels:
-    """Make the labels of a frame from one row per box; see FrameLabels.of."""
+    """Make the labels of a frame from one row per box; for the other arguments see FrameLabels.of."""
     columns: list[Any] = [*zip(*rows)] or [[]] * 5
     boxes, names, ids, scores, extra = columns
-    return FrameLabels.of(frame.name, frame.stamp_ns, boxes, names, ids, scores, extra, notes, where)
+    return FrameLabels.of(frame.name, frame.stamp_ns, boxes, names, ids, scores, extra, notes, source)
 
 
 def read_frame_labels(frame: Frame) -> FrameLabels:
-    """Read the labels of a frame in a recording, with their original class names."""
+    """Read the labels of a frame of a recording, with their original class names."""
     truth = frame.truth()
     if truth is None:
         return FrameLabels.of(frame.name, frame.stamp_ns)
@@ -170,7 +172,7 @@ def _to_integers(ids: np.ndarray) -> np.ndarray:
 
 
 def to_ground_truth(labels: FrameLabels) -> GroundTruth:
-    """Convert labels to GroundTruth; unknown classes become Misc and keep their name in extras."""
+    """Convert labels to GroundTruth. Unknown classes become Misc, with their name in extras."""
     extras = []
     for k, (name, extra) in enumerate(zip(labels.class_names, labels.extra)):
         class_name = {} if name in CLASSES else {"class_name": name}
@@ -179,7 +181,7 @@ def to_ground_truth(labels: FrameLabels) -> GroundTruth:
 
 
 def get_id_and_score(labels: FrameLabels, k: int) -> dict[str, Any]:
-    """Return the track_id and score of box k as a dict that omits missing values."""
+    """Return a dict with the track_id and score of box k, without missing values."""
     fields: dict[str, Any] = {}
     if labels.track_ids[k] != NO_TRACK:
         fields["track_id"] = int(labels.track_ids[k])
@@ -189,7 +191,7 @@ def get_id_and_score(labels: FrameLabels, k: int) -> dict[str, Any]:
 
 
 def is_unchanged(box: Sequence[float] | np.ndarray, original: Sequence[float] | np.ndarray) -> bool:
-    """Return True if a box (7,) equals the original that was read, so that its other fields are valid."""
+    """Return True if a box (7,) equals the box in the file, so that its other fields are still valid."""
     difference = np.subtract(box, original)
     difference[6] = wrap_angle(difference[6])
     return bool(np.abs(difference).max() < MAX_DIFFERENCE)

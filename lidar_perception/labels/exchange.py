@@ -1,4 +1,4 @@
-"""Import and export of labels: table of the formats, and recognition of the format of a file."""
+"""Import and export of labels in all formats, and recognition of the format of a file."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from lidar_perception.labels.names import resolve_format
 from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
 
-Read = Callable[[Path, Sequence[Frame]], DriveLabels]
-Write = Callable[..., None]  # arguments: labels, out, frames, force
+Reader = Callable[[Path, Sequence[Frame]], DriveLabels]
+Writer = Callable[..., None]  # arguments: labels, out, frames, force
 
-# Reader and writer of each format; with `force`, a writer replaces existing files. A new format is
-# one file and one line here.
-FORMATS: dict[str, tuple[Read, Write]] = {
+# Reader and writer of each format; with `force`, a writer replaces existing files. To add a format,
+# add a module with both functions, and a line here.
+FORMATS: dict[str, tuple[Reader, Writer]] = {
     "kitti": (kitti_object.read, kitti_object.write),
     "kitti-tracking": (kitti_tracking.read, kitti_tracking.write),
     "nuscenes-detection": nuscenes.detection_format,
@@ -50,17 +50,17 @@ FORMATS: dict[str, tuple[Read, Write]] = {
     "mcap": (bag.read, bag.write),
     "mcap-labels": (bag.read, partial(bag.write, clouds=False)),
 }
-# Readers of these formats and of those that are only read.
-READERS: dict[str, Read] = {name: read for name, (read, _) in FORMATS.items()} | {
+# Readers of these formats and of formats that cannot be written.
+READERS: dict[str, Reader] = {name: read for name, (read, _) in FORMATS.items()} | {
     "kitti-raw": kitti_raw.read,
     "openpcdet": openpcdet.read,
 }
-WITH_NOTES = {"kitti", "kitti-tracking", "openlabel", "mcap", "mcap-labels"}
+FORMATS_WITH_NOTES = {"kitti", "kitti-tracking", "openlabel", "mcap", "mcap-labels"}
 
 
 @dataclass(frozen=True)
 class ExportResult:
-    """Number of exported boxes and frames, and descriptions of content that was left out."""
+    """Result of an export: number of boxes and frames, and descriptions of omitted content."""
 
     path: Path
     boxes: int
@@ -76,7 +76,7 @@ def import_labels(path: Path, format: str, frames: Sequence[Frame]) -> DriveLabe
     """
     with np.errstate(all="ignore"):  # FrameLabels.of rejects numbers that overflow
         read = READERS[resolve_format(format, READERS)]
-        return read(path, frames[:])  # frames of a slice of a bag do not hold their clouds
+        return read(path, frames[:])  # the frames in a slice of a bag do not hold their clouds
 
 
 def export_labels(
@@ -85,18 +85,18 @@ def export_labels(
     """Write the labels of a drive; existing files are replaced only with `force`.
 
     Raises:
-        InputError: The labels cannot be written; nothing is left behind.
+        InputError: The labels cannot be written; no files remain.
     """
     format = resolve_format(format, FORMATS)
     if len(labels) != len(frames):
         raise InputError(
-            f"there are labels of {len(labels)} frames for a drive of {len(frames)}; give labels of the same frames"
+            f"the labels have {len(labels)} frames, but the drive has {len(frames)}; give the labels of this drive"
         )
     report_format_errors(
         "a preserved field of the file that the labels were read from",
         lambda: FORMATS[format][1](labels, out, frames[:], force),
     )
-    notes = 0 if format in WITH_NOTES else sum(len(frame_labels.notes) for frame_labels in labels.frames)
+    notes = 0 if format in FORMATS_WITH_NOTES else sum(len(frame_labels.notes) for frame_labels in labels.frames)
     has_ids = format == "kitti" and any((f.track_ids != NO_TRACK).any() for f in labels.frames)
     return ExportResult(
         out,
@@ -133,10 +133,9 @@ def recognise_format(path: Path) -> str:
         if find_label_folder(path, folder) != path:
             return format
     for file in files:
-        recognised = _recognise_text(file) if file.suffix == ".txt" else _recognise_json(read_json(file))
-        if recognised:
-            return recognised
-    raise InputError(f"no labels are recognised in {path}; give their format with --from, one of {', '.join(READERS)}")
+        if format := _recognise_text(file) if file.suffix == ".txt" else _recognise_json(read_json(file)):
+            return format
+    raise InputError(f"cannot recognise the label format of {path}; set it with --from to one of {', '.join(READERS)}")
 
 
 def _recognise_text(file: Path) -> str:
@@ -158,7 +157,7 @@ def _recognise_text(file: Path) -> str:
 
 
 def _recognise_json(content: Any) -> str:
-    """Recognise a JSON format by its keys; return "" for files without boxes and other JSON files."""
+    """Recognise a JSON format by its keys; return "" for other JSON files and files without boxes."""
     with suppress(TypeError, LookupError, AttributeError):  # values may be of any type
         if isinstance(content, list) or "objs" in content:
             boxes = content if isinstance(content, list) else content["objs"]

@@ -12,10 +12,10 @@ ALIASES = {"kitti-object": "kitti", "bag": "mcap", "bag-labels": "mcap-labels"}
 def resolve_format(name: str, names: Iterable[str]) -> str:
     """Return the name of a format as it is spelt in `names`.
 
-    Case does not matter, nor does the choice between hyphens and underscores.
+    Case and the choice between hyphens and underscores do not matter.
 
     Raises:
-        InputError: `names` has no such format.
+        InputError: The format is not in `names`.
     """
     format_name = name.strip().lower().replace("_", "-")
     format_name, names = ALIASES.get(format_name, format_name), list(names)

@@ -84,7 +84,7 @@ class DetectorNode(ManagedNode):
         self._set_detector(detector, reference)
 
     def _load_network(self) -> None:
-        with report_compilation(self.get_logger().info, whole_detector=True):
+        with report_compilation(self.get_logger().info, full_detector=True):
             detector = self._load_on_device()
         self._set_detector(detector, self.loader.describe_network(detector.networks[0].config))
         if detector.warning:  # not reported as the state, which shows what the node waits for

@@ -1,1 +1,1 @@
-"""Rendering of clouds and boxes without a GPU or a browser, by a small rasterizer in NumPy."""
+"""Rendering of clouds and boxes with a small rasterizer in NumPy, without a GPU or a browser."""

@@ -1,4 +1,4 @@
-"""Canvas for points with depth, lines, filled polygons and text."""
+"""Canvas to draw points with depth, lines, filled polygons and text."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 
 Color = tuple[int, int, int]  # r g b, 0..255
-DASH, GAP = 7.0, 5.0  # lengths of dashes and gaps in pixels
+DASH, GAP = 7.0, 5.0  # lengths of the dashes and gaps of a dashed line in pixels
 MAX_RADIUS = 4  # maximum radius of a point in pixels
-OUTLINE_COLOR = (10, 14, 22)  # outline of text
-DEPTH_STEPS = np.uint16(65535)  # points are sorted by their rounded depth
+OUTLINE_COLOR = (10, 14, 22)  # colour of the outline of text
+DEPTH_STEPS = np.uint16(65535)  # number of steps to which depths are rounded to sort points
 
 
 class Text(NamedTuple):
-    """A text on a canvas.
+    """Text to draw on a canvas.
 
     Attributes:
-        at: Column and row of the anchor in pixels.
-        text: The text.
+        position: Column and row of the anchor in pixels.
+        text: String to draw.
         color: Colour of the letters.
         size: Height in pixels.
         anchor: Anchor as in Pillow, such as "lm" (left, middle) or "mb" (middle, bottom).
     """
 
-    at: tuple[float, float] | np.ndarray
+    position: tuple[float, float] | np.ndarray
     text: str
     color: Color
     size: int
     anchor: str = "mm"
 
     def shift(self, columns: float) -> Text:
-        """Return the text shifted to the right by `columns`."""
-        column, row = self.at
-        return self._replace(at=(column + columns, row))
+        """Return the text shifted to the right by `columns` pixels."""
+        column, row = self.position
+        return self._replace(position=(column + columns, row))
 
 
 class Canvas:
@@ -52,17 +52,17 @@ class Canvas:
         self.pixels = np.empty((height, width, 3), np.uint8)
         self.pixels[:] = color
 
-    def draw_points(self, at: np.ndarray, depth: np.ndarray, colors: np.ndarray, radius: np.ndarray) -> None:
+    def draw_points(self, positions: np.ndarray, depth: np.ndarray, colors: np.ndarray, radius: np.ndarray) -> None:
         """Draw points as squares; near points cover far ones.
 
         Args:
-            at: (N, 2) positions of the points.
+            positions: (N, 2) column and row of each point.
             depth: (N,) distance from the eye.
             colors: (N, 3) uint8.
-            radius: (N,) half side of the squares in pixels; it must not increase with the depth.
+            radius: (N,) half side of the squares in pixels, which must not increase with the depth.
         """
         margin = MAX_RADIUS
-        column, row = np.floor(at).T
+        column, row = np.floor(positions).T
         order = np.flatnonzero(
             (column >= -margin) & (column < self.width + margin) & (row >= -margin) & (row < self.height + margin)
         )
@@ -72,7 +72,8 @@ class Canvas:
         depth_steps = depth * (DEPTH_STEPS / max(depth.max(), 1e-6))
         order = order[np.argsort(DEPTH_STEPS - depth_steps.astype(np.uint16), kind="stable")]  # radix sort for uint16
         cells = np.stack([column[order], row[order]], axis=1).astype(np.int32)
-        # One packed number per pixel, in an image with a margin. The last of equal indices wins.
+        # Each pixel is packed into one number, in an image with a margin. If an index occurs several
+        # times, the last value is stored.
         stride = self.width + 2 * margin
         image = np.zeros((self.height + 2 * margin, stride, 4), np.uint8)
         image[margin:-margin, margin:-margin, :3] = self.pixels
@@ -82,7 +83,7 @@ class Canvas:
         values = packed.view(np.uint32).ravel()
         first_pixel = (cells[:, 1] + margin) * stride + cells[:, 0] + margin
         sides = np.clip(np.round(2 * radius[order]), 1, 2 * margin - 1).astype(np.int64)
-        for side in np.unique(sides):  # from far to near, because the radius does not grow with the depth
+        for side in np.unique(sides):  # from far to near points, because the radius does not increase with the depth
             has_side = sides == side
             shift = np.arange(side) - side // 2
             offsets = (shift[:, None] * stride + shift).ravel()
@@ -110,7 +111,7 @@ class Canvas:
         opacity = np.broadcast_to(np.asarray(alpha, np.float32), len(segments))[indices]
         direction = end - start
         is_steep = np.abs(direction[:, 1]) > np.abs(direction[:, 0])
-        # One sample per column (per row of a steep line), and several pixels across the line.
+        # Draw one sample per column, or per row of a steep line, with several pixels across the line.
         main_coordinate = np.where(
             is_steep[:, None], np.stack([start[:, 1], end[:, 1]], axis=1), np.stack([start[:, 0], end[:, 0]], axis=1)
         )
@@ -126,8 +127,8 @@ class Canvas:
         centre = start[line_index] + fraction * direction[line_index]
         length = np.maximum(np.hypot(*direction.T), 1e-9)
         if dashed:
-            offset = np.linalg.norm(start - segments[indices, 0], axis=1)
-            is_dash = (offset[line_index] + fraction[:, 0] * length[line_index]) % (DASH + GAP) < DASH
+            clipped_length = np.linalg.norm(start - segments[indices, 0], axis=1)
+            is_dash = (clipped_length[line_index] + fraction[:, 0] * length[line_index]) % (DASH + GAP) < DASH
             centre, line_index, cell = centre[is_dash], line_index[is_dash], cell[is_dash]
         cosine = (np.abs(direction).max(axis=1) / length)[line_index]  # cosine of the angle to the main axis
         half_count = int(np.ceil(width)) + 1
@@ -141,7 +142,7 @@ class Canvas:
         self._blend(column, row, coverage * opacity[line_index, None], np.asarray(colors)[line_index])
 
     def _blend(self, column: np.ndarray, row: np.ndarray, coverage: np.ndarray, colors: np.ndarray) -> None:
-        """Blend colours into pixels; if a pixel occurs several times, the most opaque value wins.
+        """Blend colours into pixels; if a pixel occurs several times, the most opaque value is used.
 
         Args:
             column, row: (M, P) pixels.
@@ -154,28 +155,31 @@ class Canvas:
         order = np.argsort(opacities, kind="stable")
         index, opacities, color_index = index[order], opacities[order], color_index[order]
         last_entry = np.full(self.width * self.height, -1, np.int64)
-        last_entry[index] = np.arange(len(index))  # the last of equal indices wins
-        winners = last_entry[last_entry >= 0]
+        last_entry[index] = np.arange(len(index))  # if an index occurs several times, the last value is stored
+        entries = last_entry[last_entry >= 0]
         flat_pixels = self.pixels.reshape(-1, 3)
-        pixel_index, opacity = index[winners], opacities[winners, None]
+        pixel_index, opacity = index[entries], opacities[entries, None]
         flat_pixels[pixel_index] = np.round(
-            flat_pixels[pixel_index] * (1 - opacity) + colors[color_index[winners]] * opacity
+            flat_pixels[pixel_index] * (1 - opacity) + colors[color_index[entries]] * opacity
         )
 
     def _clip(self, segments: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Clip segments to the image (Liang and Barsky, 1984).
 
-        Returns the indices (K,) of the segments that touch the image, and the start and end (K, 2)
-        of their parts inside it.
+        Returns:
+            The indices (K,) of the segments that touch the image, and the start and end (K, 2) of
+            the parts inside the image.
         """
         low = np.array([-width - 1.0] * 2)
         high = np.array([self.width, self.height]) + width + 1.0
         with np.errstate(divide="ignore", invalid="ignore"):
             start, direction = segments[:, 0], segments[:, 1] - segments[:, 0]
-            at_low, at_high = (low - start) / direction, (high - start) / direction
+            low_fraction, high_fraction = (low - start) / direction, (high - start) / direction
         is_outside = (direction == 0) & ((start < low) | (start > high))
-        enter_fraction = np.where(direction == 0, 0.0, np.minimum(at_low, at_high)).max(axis=1).clip(0.0)
-        leave_fraction = np.where(direction == 0, 1.0, np.maximum(at_low, at_high)).min(axis=1).clip(max=1.0)
+        enter_fraction = np.where(direction == 0, 0.0, np.minimum(low_fraction, high_fraction)).max(axis=1).clip(0.0)
+        leave_fraction = (
+            np.where(direction == 0, 1.0, np.maximum(low_fraction, high_fraction)).min(axis=1).clip(max=1.0)
+        )
         indices = np.flatnonzero(
             (enter_fraction < leave_fraction) & ~is_outside.any(axis=1) & np.isfinite(segments).all(axis=(1, 2))
         )
@@ -216,9 +220,9 @@ class Canvas:
             return
         image = Image.fromarray(self.pixels)
         draw = ImageDraw.Draw(image)
-        for at, text, color, size, anchor in items:
+        for position, text, color, size, anchor in items:
             draw.text(
-                (float(at[0]), float(at[1])),
+                (float(position[0]), float(position[1])),
                 text,
                 fill=color,
                 font=load_font(size),
@@ -231,7 +235,7 @@ class Canvas:
 
 @lru_cache(maxsize=16)
 def load_font(size: int) -> Any:
-    """Load DejaVu Sans, which comes with matplotlib."""
+    """Load the font DejaVu Sans, which is part of matplotlib."""
     import matplotlib
 
     return ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", size)

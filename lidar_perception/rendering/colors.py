@@ -12,16 +12,16 @@ BACKGROUND = np.array([11, 15, 24], np.uint8)
 LABEL = (235, 240, 245)  # colour of labelled boxes, which are dashed
 TEXT, DIM = (225, 230, 238), (130, 142, 160)
 GRID = (38, 47, 64)
-# Other classes have the brightest possible colour of their markers.
+# Colours of the detected classes. Other classes have the colours of their markers at full brightness.
 DETECTED_COLORS = dict(zip(DETECTED, ((64, 186, 255), (255, 104, 80), (255, 212, 66))))
-# Colours by height above the ground in metres: dull at the ground, light at roof height.
+# Heights above the ground in metres of HEIGHT_COLORS, which are dull at the ground and light at roof height.
 HEIGHTS = (-0.3, 0.15, 0.9, 1.8, 3.5, 7.0)
 HEIGHT_COLORS = np.array(
     [[46, 66, 106], [70, 96, 142], [76, 140, 166], [126, 190, 184], [206, 216, 190], [224, 200, 210]], np.float32
 )
 GROUND_COLOR, UNCLUSTERED_COLOR = np.array([[92, 120, 158], [140, 153, 173]], np.uint8)
 CLUSTER_COLORS = np.array(
-    [  # muted, so that boxes stand out
+    [  # these colours are muted, so that boxes stand out
         [143, 120, 219],
         [84, 166, 158],
         [209, 143, 168],
@@ -40,7 +40,7 @@ INTENSITY_COLORS = np.array([[38, 52, 84], [74, 104, 150], [140, 180, 190], [250
 
 
 def color_by_height(heights: np.ndarray) -> np.ndarray:
-    """Return colours (N, 3) uint8 for points at heights (N,) above the ground in metres."""
+    """Return colours (N, 3) uint8 for points at heights (N,) in metres above the ground."""
     return _interpolate(heights, HEIGHTS, HEIGHT_COLORS)
 
 
@@ -65,7 +65,7 @@ def color_by_cluster(ground: np.ndarray, cluster_ids: np.ndarray) -> np.ndarray:
 
 
 def _interpolate(values: np.ndarray, stops: tuple[float, ...], colors: np.ndarray) -> np.ndarray:
-    """Interpolate between the colours (S, 3) at S stops, with a table of 256 values."""
+    """Interpolate between the colours (S, 3) at S stops, with a lookup table of 256 colours."""
     steps = np.linspace(stops[0], stops[-1], 256)
     table = np.stack([np.interp(steps, stops, colors[:, c]) for c in range(3)], axis=1)
     position = (np.asarray(values, np.float32) - stops[0]) / (stops[-1] - stops[0])

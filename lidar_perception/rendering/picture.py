@@ -1,4 +1,4 @@
-"""Picture of a frame: perspective view on the left, bird's-eye view on the right."""
+"""Drawing of a frame as an image: perspective view on the left, bird's-eye view on the right."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from lidar_perception.types import CLASSES, PointCloud
 
 EDGES = np.array(
     [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]]
-)  # of box_corners
+)  # edges of a box as pairs of corners, see box_corners
 FRONT, FLOOR = [0, 3, 7, 4], [0, 1, 2, 3]  # corners of the front and the bottom face
-OTHER_FACES = [[1, 2, 6, 5], [0, 1, 5, 4], [2, 3, 7, 6], [4, 5, 6, 7]]
-RING_POINTS = 180
+OTHER_FACES = [[1, 2, 6, 5], [0, 1, 5, 4], [2, 3, 7, 6], [4, 5, 6, 7]]  # corners of the other faces
+RING_POINTS = 180  # number of points with which a range ring is drawn
 MIN_RANGE, MAX_RANGE_AHEAD, MAX_RANGE_AROUND = 6.0, 55.0, 45.0  # limits of the displayed range in metres
-POINT_SHARE = 5e-4  # radius of a point, as a fraction of the range
-FOV = 60.0  # vertical field of view in degrees
-FAR_PERCENTILE = 98  # percentile of the points' ranges that sets the range of a picture
-BEV_SHARE = 0.375  # fraction of the width used by the bird's-eye view
-CLASS_SHARE = 0.5  # weight of the class colour in the colour of points in boxes
-ARROW_S = 1.0  # motion shown by an arrow, in seconds
+POINT_RADIUS_FRACTION = 5e-4  # radius of a point as a fraction of the displayed range
+FOV = 60.0  # horizontal field of view in degrees
+RANGE_PERCENTILE = 98  # percentile of the points' ranges that is chosen as displayed range
+BEV_FRACTION = 0.375  # fraction of the width used by the bird's-eye view
+CLASS_COLOR_WEIGHT = 0.5  # weight of the class colour in the colour of points in boxes
+ARROW_S = 1.0  # duration of the motion that an arrow shows, in seconds
 SCALE_WIDTH = 110  # width of the colour scale in pixels
-MIN_SPEED = 0.5  # in m/s; slower boxes have no arrow
+MIN_SPEED = 0.5  # minimum speed of boxes with an arrow, in m/s
 NO_BOXES = np.zeros((0, 7))
 
 
@@ -47,9 +47,9 @@ class Boxes:
     Attributes:
         boxes: (K, 7) [x y z l w h yaw].
         class_ids: (K,) indices into CLASSES.
-        texts: K short strings to write above the boxes, or empty.
-        trails: Recent positions (N, 3) of each box, oldest first, or empty.
-        velocities: (K, 2) m/s; (0, 2) without arrows.
+        texts: K short strings to write above the boxes; empty for none.
+        trails: Recent positions (N, 3) of each box, oldest first; empty for none.
+        velocities: (K, 2) m/s; (0, 2) for no arrows.
     """
 
     boxes: np.ndarray = field(default_factory=lambda: NO_BOXES)
@@ -61,14 +61,14 @@ class Boxes:
 
 @dataclass(frozen=True)
 class Stage:
-    """Settings shared by all pictures of a video.
+    """Settings shared by all images of a video.
 
     Attributes:
         reach: Displayed range around the sensor, metres.
-        ahead: True to show only the area ahead of the sensor, False to show all around.
-        ground: z of the ground at the sensor.
-        color: Colour of the points, "height" or "intensity".
-        width, height: Size of a picture in pixels.
+        ahead: True to show only the area ahead of the sensor, False to show all directions.
+        ground: z of the ground at the sensor, metres.
+        color: Value that determines the colours of the points, "height" or "intensity".
+        width, height: Size of an image in pixels.
     """
 
     reach: float
@@ -83,14 +83,14 @@ class Stage:
         scan: PointCloud, sensor_height: float, ahead: bool, color: str = "height", size: tuple[int, int] = (1280, 720)
     ) -> Stage:
         """Choose the settings for a video, given its first scan."""
-        typical_range = np.percentile(horizontal_range(scan.xyz), FAR_PERCENTILE) if len(scan) else MIN_RANGE
+        typical_range = np.percentile(horizontal_range(scan.xyz), RANGE_PERCENTILE) if len(scan) else MIN_RANGE
         extent = float(np.clip(typical_range, MIN_RANGE, MAX_RANGE_AHEAD if ahead else MAX_RANGE_AROUND))
         return Stage(extent, ahead, -sensor_height, color, *size)
 
     @property
     def views(self) -> tuple[Perspective, BirdsEye]:
         """Perspective view from behind the sensor, and bird's-eye view."""
-        extent, right_width = self.reach, round(self.width * BEV_SHARE)
+        extent, right_width = self.reach, round(self.width * BEV_FRACTION)
         left_width = self.width - right_width
         if self.ahead:
             perspective = Perspective(
@@ -99,7 +99,7 @@ class Stage:
                 FOV,
                 left_width,
                 self.height,
-                POINT_SHARE * extent,
+                POINT_RADIUS_FRACTION * extent,
             )
             return perspective, BirdsEye((0.44 * extent, 0.0), self.height / (1.14 * extent), right_width, self.height)
         perspective = Perspective(
@@ -108,17 +108,17 @@ class Stage:
             FOV,
             left_width,
             self.height,
-            POINT_SHARE * extent,
+            POINT_RADIUS_FRACTION * extent,
         )
         return perspective, BirdsEye((0.0, 0.0), self.height / (2.1 * extent), right_width, self.height)
 
     @property
-    def rings(self) -> np.ndarray:
+    def ring_radii(self) -> np.ndarray:
         """Radii of the range rings on the ground, metres."""
         step = next(step for step in (1, 2, 5, 10, 20) if self.reach <= 6.5 * step)
         return np.arange(step, 1.6 * self.reach, step)
 
-    def colors(self, scan: PointCloud) -> np.ndarray:
+    def color_points(self, scan: PointCloud) -> np.ndarray:
         """Return the colours (N, 3) uint8 of the points of a scan."""
         if self.color == "intensity" and scan.intensity is not None:
             return color_by_intensity(scan.intensity)
@@ -137,36 +137,36 @@ def draw_frame(
     """Draw a frame as an image (height, width, 3) uint8 [r g b].
 
     Args:
-        stage: Settings of the picture.
+        stage: Settings of the image.
         scan: Cloud of N points.
         boxes: Boxes to draw.
-        labels: (L, 7) labelled boxes, drawn dashed.
+        labels: (L, 7) labelled boxes, which are drawn with dashed lines.
         title, time: Texts at the top left and right.
-        colors: (N, 3) uint8 colours of the points; None to use those of the stage.
+        colors: (N, 3) uint8 colours of the points; None for the colours of `stage`.
     """
     with_scale = colors is None
-    colors = highlight_points(stage.colors(scan) if colors is None else colors, scan.xyz, boxes)
-    picture = Canvas(stage.width, stage.height, BACKGROUND)
+    colors = highlight_points(stage.color_points(scan) if colors is None else colors, scan.xyz, boxes)
+    image = Canvas(stage.width, stage.height, BACKGROUND)
     left_column, texts = 0, _make_heading(stage, title, time)
     for view in stage.views:
         canvas = Canvas(view.width, view.height, BACKGROUND)
         view_texts = draw_view(canvas, view, stage, scan.xyz, colors, boxes, labels)
-        picture.paste(canvas, left_column, 0)
+        image.paste(canvas, left_column, 0)
         texts += [text.shift(left_column) for text in view_texts]
         left_column += view.width
     left_width = stage.views[0].width
-    picture.draw_lines([[[left_width, 0], [left_width, stage.height]]], GRID, 1.5)
-    picture.draw_texts([*texts, *_draw_legend(picture, stage, boxes, labels, with_scale)])
-    return picture.pixels
+    image.draw_lines([[[left_width, 0], [left_width, stage.height]]], GRID, 1.5)
+    image.draw_texts([*texts, *_draw_legend(image, stage, boxes, labels, with_scale)])
+    return image.pixels
 
 
 def highlight_points(colors: np.ndarray, xyz: np.ndarray, boxes: Boxes) -> np.ndarray:
-    """Return colours (N, 3) in which points inside a box have a light version of its class colour."""
+    """Return colours (N, 3) in which points in a box have a light version of its class colour."""
     colors = colors.copy()
     rows, first_rows = points_in_boxes(xyz, boxes.boxes, 0.1)
     for k, class_id in enumerate(boxes.class_ids):
         inside = rows[first_rows[k] : first_rows[k + 1]]
-        colors[inside] = CLASS_SHARE * np.array(get_class_color(class_id)) + (1 - CLASS_SHARE) * 240
+        colors[inside] = CLASS_COLOR_WEIGHT * np.array(get_class_color(class_id)) + (1 - CLASS_COLOR_WEIGHT) * 240
     return colors
 
 
@@ -179,14 +179,15 @@ def draw_view(
     detections: Boxes,
     labels: np.ndarray = NO_BOXES,
 ) -> list[Text]:
-    """Draw points (N, 3) with colors (N, 3), boxes and labels in one view.
+    """Draw points (N, 3) in colors (N, 3), boxes and labels in one view.
 
-    Returns the texts to draw on top.
+    Returns:
+        The texts to draw on top.
     """
     texts = _draw_rings(canvas, view, stage)
     pixels, depth = view.project(xyz)
     in_front = np.flatnonzero(depth > NEAR)
-    canvas.draw_points(pixels[in_front], depth[in_front], colors[in_front], view.radius(depth[in_front]))
+    canvas.draw_points(pixels[in_front], depth[in_front], colors[in_front], view.find_radii(depth[in_front]))
     _draw_sensor(canvas, view, stage)
     box_colors = np.array([get_class_color(c) for c in detections.class_ids], float).reshape(-1, 3)
     boxes = detections.boxes.astype(float)
@@ -207,18 +208,20 @@ def _draw_rings(canvas: Canvas, view: View, stage: Stage) -> list[Text]:
     angles = np.linspace(0, 2 * np.pi, RING_POINTS)
     circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(RING_POINTS)], axis=1)
     arcs = np.stack([circle[:-1], circle[1:]], axis=1)
-    circles = stage.rings[:, None, None, None] * arcs + [0, 0, stage.ground]
+    circles = stage.ring_radii[:, None, None, None] * arcs + [0, 0, stage.ground]
     canvas.draw_lines(project_lines(view, circles.reshape(-1, 2, 3)), GRID, 1.2)
-    text_positions = np.stack([stage.rings * 0.8, stage.rings * -0.6, np.full(len(stage.rings), stage.ground)], axis=1)
+    text_positions = np.stack(
+        [stage.ring_radii * 0.8, stage.ring_radii * -0.6, np.full(len(stage.ring_radii), stage.ground)], axis=1
+    )
     return [
         Text(pixel, f"{radius:g} m", DIM, 11)
-        for pixel, depth, radius in zip(*view.project(text_positions), stage.rings)
+        for pixel, depth, radius in zip(*view.project(text_positions), stage.ring_radii)
         if depth > NEAR and _has_room(view, pixel)
     ]
 
 
 def _draw_sensor(canvas: Canvas, view: View, stage: Stage) -> None:
-    """Draw an arrowhead at the position of the sensor that points ahead."""
+    """Draw an arrowhead at the position of the sensor that points forward."""
     size = 0.013 * stage.reach
     corners = np.array([[1.6, 0, 0], [-1, 1, 0], [-0.4, 0, 0], [-1, -1, 0]]) * size
     pixels, depth = view.project(corners + [0, 0, stage.ground])
@@ -274,7 +277,7 @@ def _draw_arrows(canvas: Canvas, view: View, boxes: Boxes, box_colors: np.ndarra
 
 
 def _make_box_texts(view: View, boxes: Boxes) -> list[Text]:
-    """Return the texts of the boxes, placed above them in the picture."""
+    """Return the texts of the boxes, placed above them in the image."""
     pixels, depth = view.project(box_corners(boxes.boxes.astype(float)))
     return [
         Text((corners[:, 0].mean(), corners[:, 1].min() - 2), text, get_class_color(class_id), 12, "mb")
@@ -296,7 +299,8 @@ def _make_heading(stage: Stage, title: str, time: str) -> list[Text]:
 def _draw_legend(canvas: Canvas, stage: Stage, boxes: Boxes, labels: np.ndarray, with_scale: bool) -> list[Text]:
     """Draw the legend: classes with box counts, the dashed line of labels, and the colour scale.
 
-    Returns the texts to draw on top.
+    Returns:
+        The texts to draw on top.
     """
     items, x, y = [], 18.0, stage.height - 20.0
     entries = [

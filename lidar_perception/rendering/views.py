@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-NEAR = 0.3  # near clipping distance in metres
+NEAR = 0.3  # distance of the near clipping plane in metres
 
 
 class View(Protocol):
@@ -23,10 +23,10 @@ class View(Protocol):
     def project(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project points (..., 3); return their pixels (..., 2) [column row] and depths (...).
 
-        Points with a depth below NEAR cannot be drawn.
+        Points with a depth below NEAR must not be drawn.
         """
 
-    def radius(self, depth: np.ndarray) -> np.ndarray:
+    def find_radii(self, depth: np.ndarray) -> np.ndarray:
         """Return the radius in pixels of points at these depths (N,)."""
 
 
@@ -39,7 +39,7 @@ class Perspective:
         target: Point at the centre of the image, in the LiDAR frame, metres.
         fov: Horizontal field of view in degrees.
         width, height: Size of the image in pixels.
-        point: Radius of a point in metres.
+        point_radius: Radius of a point in metres.
     """
 
     eye: tuple[float, float, float]
@@ -47,7 +47,7 @@ class Perspective:
     fov: float
     width: int
     height: int
-    point: float = 0.022
+    point_radius: float = 0.022
 
     @property
     def focal(self) -> float:
@@ -57,11 +57,11 @@ class Perspective:
     @cached_property
     def axes(self) -> np.ndarray:
         """Camera axes (3, 3) as columns: right and down, scaled by the focal length, and forward."""
-        ahead = np.subtract(self.target, self.eye)
-        ahead /= np.linalg.norm(ahead)
-        right = np.cross(ahead, [0.0, 0.0, 1.0])
+        forward = np.subtract(self.target, self.eye)
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
-        return np.stack([right * self.focal, np.cross(ahead, right) * self.focal, ahead], axis=1)
+        return np.stack([right * self.focal, np.cross(forward, right) * self.focal, forward], axis=1)
 
     def project(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         axes = self.axes
@@ -71,8 +71,8 @@ class Perspective:
         pixels += np.array([self.width / 2, self.height / 2], xyz.dtype)
         return pixels, depth
 
-    def radius(self, depth: np.ndarray) -> np.ndarray:
-        return np.clip(self.point * self.focal / np.maximum(depth, NEAR), 0.5, 3.0)
+    def find_radii(self, depth: np.ndarray) -> np.ndarray:
+        return np.clip(self.point_radius * self.focal / np.maximum(depth, NEAR), 0.5, 3.0)
 
 
 @dataclass(frozen=True)
@@ -83,28 +83,28 @@ class BirdsEye:
         centre: x and y at the centre of the image, metres.
         scale: Pixels per metre.
         width, height: Size of the image in pixels.
-        above: Height of the eye in metres.
+        eye_height: z of the eye in the LiDAR frame, metres.
     """
 
     centre: tuple[float, float]
     scale: float
     width: int
     height: int
-    above: float = 1000.0
+    eye_height: float = 1000.0
 
     def project(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         origin_pixel = [self.width / 2 + self.centre[1] * self.scale, self.height / 2 + self.centre[0] * self.scale]
         pixels = np.array(origin_pixel, xyz.dtype) - xyz[..., 1::-1] * xyz.dtype.type(self.scale)
-        return pixels, self.above - xyz[..., 2]
+        return pixels, self.eye_height - xyz[..., 2]
 
-    def radius(self, depth: np.ndarray) -> np.ndarray:
+    def find_radii(self, depth: np.ndarray) -> np.ndarray:
         return np.full(np.shape(depth), 0.75)
 
 
 def project_lines(view: View, lines: np.ndarray) -> np.ndarray:
     """Project lines (S, 2, 3) to segments (S, 2, 2) in pixels.
 
-    Lines that pass behind the eye are cut; lines that are completely behind it are NaN.
+    Lines that pass behind the eye are clipped; lines that are completely behind it become NaN.
     """
     pixels, depth = view.project(lines)
     is_behind = depth < NEAR

@@ -1,1 +1,1 @@
-"""Support for long-running commands: files, processes, resuming, terminal output, compilation."""
+"""Infrastructure of commands: files, processes, resuming, terminal output, compilation."""

@@ -1,6 +1,6 @@
-"""Progress reports and locking for the first compilation on a machine.
+"""Progress reports and locks for the first compilation on a machine.
 
-Numba caches compiled code, so later starts load it in a few seconds.
+Numba caches compiled code, so later starts take only a few seconds.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from pathlib import Path
 from time import perf_counter, sleep
 from typing import Any
 
-REPORT_AFTER_S = 1.0  # shorter compilations and waits are not reported
-REPORT_INTERVAL_S = 10.0  # compilation time between two reports
-POLL_INTERVAL_S = 0.1
+REPORT_AFTER_S = 1.0  # minimum duration of compilations and waits that are reported
+REPORT_INTERVAL_S = 10.0  # compilation time between two progress reports
+POLL_INTERVAL_S = 0.1  # time between checks for the end of a compilation or a wait
 
 COMPILING_MESSAGE = "compiling numeric code for this machine, once: about a minute on a free core; the result is cached"
 WAITING_MESSAGE = "waiting for another process to compile, or to load compiled code"
 
 
 class _Compilation:
-    """Listener for Numba's compile events; Numba sends none when it loads code from its cache."""
+    """Listener for Numba's compile events, which are not sent when code is loaded from the cache."""
 
-    current: _Compilation | None = None  # compilation of the outermost block
+    current: _Compilation | None = None  # compilation of the outermost block of report_compilation
 
     def __init__(self, report: Callable[[str], object]):
         self.report, self.finished = report, threading.Event()
@@ -37,7 +37,10 @@ class _Compilation:
         self.announced = False
 
     def notify(self, event: Any) -> None:
-        """Handle the start or end of a function; Numba calls this while it holds its compiler lock."""
+        """Handle the start or end of the compilation of a function.
+
+        Numba calls this method while it holds its compiler lock.
+        """
         if event.is_start:
             self.start = self.start if self.depth else perf_counter()
             self.depth += 1
@@ -47,7 +50,7 @@ class _Compilation:
         if not self.depth:
             self.seconds += perf_counter() - self.start
 
-    def elapsed(self) -> float:
+    def compute_elapsed(self) -> float:
         """Return the compilation time so far, in seconds."""
         return self.seconds + (perf_counter() - self.start if self.depth else 0.0)
 
@@ -61,7 +64,7 @@ class _Compilation:
         """Report the progress until the block ends."""
         limit = REPORT_AFTER_S
         while not self.finished.wait(POLL_INTERVAL_S):
-            if (elapsed := self.elapsed()) < limit:
+            if (elapsed := self.compute_elapsed()) < limit:
                 continue
             if self.announced and elapsed >= REPORT_INTERVAL_S:
                 self.report(f"compiling: {self.count} functions in {elapsed:.0f} s so far")
@@ -70,18 +73,18 @@ class _Compilation:
 
 
 @contextmanager
-def report_compilation(report: Callable[[str], object] | None = None, whole_detector: bool = False) -> Iterator[None]:
+def report_compilation(report: Callable[[str], object] | None = None, full_detector: bool = False) -> Iterator[None]:
     """Report the progress if Numba compiles for more than REPORT_AFTER_S within the block.
 
     Args:
-        report: Function that is called with each line, by default prints to standard error. Nested
+        report: Function that is called with each line; the default prints to standard error. Nested
             blocks use the function of the outermost block.
-        whole_detector: True if the block runs a complete detector. If nothing is cached yet, the
-            compilation is then reported at the start of the block, before torch is loaded.
+        full_detector: True if the block runs a complete detector. If nothing is cached yet, the
+            compilation is then announced at the start of the block, before torch is loaded.
     """
     outer_compilation = _Compilation.current
     if outer_compilation is not None:
-        if whole_detector and not _is_cached():
+        if full_detector and not _is_cached():
             outer_compilation.announce()
         yield
         return
@@ -91,13 +94,13 @@ def report_compilation(report: Callable[[str], object] | None = None, whole_dete
         from lidar_perception.runs.terminal import errors
 
         report = errors.print
-    event.Listener.register(_Compilation)  # a base class would load numba at import
+    event.Listener.register(_Compilation)  # inheriting from Listener would load numba at import
     _Compilation.current = compilation = _Compilation(report)
     reporter = threading.Thread(target=compilation.report_until_finished, daemon=True)
     event.register("numba:compile", compilation)
     reporter.start()
     try:
-        if whole_detector and not _is_cached():
+        if full_detector and not _is_cached():
             compilation.announce()
         yield
     finally:
@@ -110,7 +113,7 @@ def report_compilation(report: Callable[[str], object] | None = None, whole_dete
 
 
 def _is_cached() -> bool:
-    """Return True if Numba's cache is up to date for a function that all detectors use."""
+    """Return True if Numba's cache is up to date, judged by a function that all detectors use."""
     from lidar_perception import geometry
 
     function: Any = geometry.counting_sort
@@ -123,10 +126,10 @@ def _is_cached() -> bool:
 
 @contextmanager
 def compile_in_background(code: str, log: Path, report: Callable[[str], object]) -> Iterator[None]:
-    """Run code that compiles in a second process during the block, if nothing is compiled yet.
+    """Compile in a second process during the block, if nothing is compiled yet.
 
-    The block ends after the process has ended. Errors of the process are not raised, because this
-    process runs the same code later and raises them then.
+    The block ends after the process has ended. Errors of the process are not raised here, because
+    this process later runs the same code and raises them then.
 
     Args:
         code: Python code that triggers the compilation, for example by opening a detector.
@@ -156,8 +159,7 @@ def lock_compilation(report: Callable[[str], object]) -> Iterator[None]:
     functions at the same time on few cores, each would take many times longer.
 
     Args:
-        report: Function that is called with a line if the wait is long, and with its duration at
-            the end.
+        report: Function that is called with a line if the wait is long, and again at its end.
     """
     with open(Path(tempfile.gettempdir()) / f"lidar_perception-{os.getuid()}.lock", "w") as lock:
         start, has_reported = perf_counter(), False

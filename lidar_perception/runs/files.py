@@ -52,9 +52,9 @@ def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES, noun: str = "")
             content = stream.read(max_bytes + 1)
         if len(content) > max_bytes:
             raise InputError(
-                f"{path} has more than {max_bytes} bytes, too many for a file of this kind; give another one"
+                f"{path} has more than {max_bytes} bytes, which is too large for this file format; give another file"
             )
-        return content.decode("utf-8-sig")  # editors on Windows write a byte order mark
+        return content.decode("utf-8-sig")  # some editors write a byte order mark
     except OSError as error:
         raise InputError(f"cannot read {title}: {error.strerror or error}") from None
     except UnicodeDecodeError as error:
@@ -63,7 +63,7 @@ def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES, noun: str = "")
 
 @contextmanager
 def convert_os_errors() -> Iterator[None]:
-    """Convert an OSError about a file (no permission, name too long) to InputError."""
+    """Convert an OSError about a file, such as a missing permission, to InputError."""
     try:
         yield
     except OSError as error:
@@ -73,7 +73,7 @@ def convert_os_errors() -> Iterator[None]:
 
 
 def shorten_error(error: BaseException, length: int = 200) -> str:
-    """Return the first line of an error message, cut to `length` characters, or the error type."""
+    """Return the first line of an error message, cut to `length` characters; the type if it is empty."""
     line = (str(error).strip().splitlines() or [type(error).__name__])[0]
     return line if len(line) <= length else f"{line[: length - 3]}..."
 
@@ -84,7 +84,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
-    """Write a file atomically: it has either the old content or all of the new content.
+    """Write a file atomically: after an error or a crash, it still has its old content.
 
     Raises:
         InputError: The file cannot be written.
@@ -113,26 +113,26 @@ def _make_temporary_path(path: Path) -> Path:
 def require_name(path: Path) -> None:
     """Raise InputError for a path without a name, such as `.`; temporary files need a name."""
     if not path.name:
-        raise InputError(f"{path} has no name for a new file; give one, such as {path / 'out'}")
+        raise InputError(f"{path} is not the name of a new file; give a name, such as {path / 'out'}")
 
 
 def check_unused(path: Path, force: bool) -> None:
     """Raise InputError if the path exists, unless `force` is True."""
     if path.exists() and not force:
-        raise InputError(f"{path} exists already; give another name or --force")
+        raise InputError(f"{path} already exists; give another name or --force")
 
 
 def refuse_other_files(folder: Path, own_patterns: Iterable[str]) -> None:
     """Raise InputError if a folder has files that do not match any of the patterns.
 
-    The caller would remove them together with its own files.
+    Call this before removing the content of the folder, to protect files of other programs.
     """
     own_patterns = [*own_patterns, "*.tmp"]
     if other_names := sorted(
         path.name for path in folder.iterdir() if not any(fnmatch(path.name, pattern) for pattern in own_patterns)
     ):
         raise InputError(
-            f"{folder} has other files too ({len(other_names)}, such as {other_names[0]}), "
+            f"{folder} has {len(other_names)} other files, such as {other_names[0]}, "
             "which would be removed; move them away, or give another name"
         )
 
@@ -144,8 +144,8 @@ def write_folder(path: Path, force: bool = False) -> Iterator[Path]:
     With force, they replace files with the same names.
 
     Raises:
-        InputError: The files cannot be written, `path` exists and force is False, or `path` has a
-            file that would not be replaced.
+        InputError: The files cannot be written; `path` exists and force is False; or `path` has
+            files that would not be replaced.
     """
     check_unused(path, force)
     temporary = _make_temporary_path(path)
@@ -154,10 +154,10 @@ def write_folder(path: Path, force: bool = False) -> Iterator[Path]:
         yield temporary
         new_files = {file.relative_to(temporary) for file in temporary.rglob("*") if not file.is_dir()}
         old_files = {file.relative_to(path) for file in path.rglob("*") if not file.is_dir()}
-        if not_replaced := sorted(old_files - new_files):
+        if remaining_files := sorted(old_files - new_files):
             raise InputError(
-                f"{path} has files that would not be replaced ({len(not_replaced)}, such as "
-                f"{not_replaced[0]}); remove the folder yourself, or give another name"
+                f"{path} has {len(remaining_files)} files that would not be replaced, such as "
+                f"{remaining_files[0]}; remove the folder, or give another name"
             )
         if not path.exists():
             temporary.rename(path)
@@ -173,19 +173,19 @@ def write_folder(path: Path, force: bool = False) -> Iterator[Path]:
 
 
 def check_writable_folder(path: Path) -> None:
-    """Raise InputError if a folder cannot be created or written into; creates nothing."""
+    """Raise InputError if a folder cannot be created or written to, without creating it."""
     existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     if not existing.is_dir():
-        raise InputError(f"cannot write into the folder {path}: {existing} is a file")
+        raise InputError(f"cannot write to the folder {path}: {existing} is a file")
     if not os.access(existing, os.W_OK | os.X_OK):
-        raise InputError(f"cannot write into the folder {path}: {os.strerror(errno.EACCES)}")
+        raise InputError(f"cannot write to the folder {path}: {os.strerror(errno.EACCES)}")
 
 
 def make_folder(path: Path) -> None:
     """Create a folder and its parents if needed.
 
     Raises:
-        InputError: The folder cannot be created or written into.
+        InputError: The folder cannot be created or written to.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -194,13 +194,13 @@ def make_folder(path: Path) -> None:
     except FileExistsError:
         raise InputError(f"{path} is a file; give the name of a folder") from None
     except OSError as error:
-        raise InputError(f"cannot write into the folder {path}: {error.strerror}") from None
+        raise InputError(f"cannot write to the folder {path}: {error.strerror}") from None
 
 
 def remove_temporaries(folder: Path, *names: str) -> None:
     """Remove the temporary files of a killed process from a folder, but not from its subfolders.
 
-    No other process may write into the folder meanwhile.
+    No other process may write to the folder at the same time.
 
     Args:
         folder: The folder.

@@ -1,6 +1,6 @@
-"""Journal of a run over frames, from which an interrupted run resumes.
+"""Journal of a run over frames, with which an interrupted run can be resumed.
 
-The first line of frames.jsonl has the settings; each further line has the record of one frame.
+The first line of frames.jsonl has the settings; each further line has the record of a frame.
 """
 
 from __future__ import annotations
@@ -19,15 +19,21 @@ from lidar_perception.runs.resuming import find_differences, lock_folder
 from lidar_perception.types import InputError
 
 JOURNAL_NAME = "frames.jsonl"
-SYNC_S = 1.0  # maximum time whose records are lost if the machine crashes
+SYNC_S = 1.0  # maximum age of records that are not yet on disk, which are lost if the machine crashes
 
 
 class Journal:
-    """Journal that is open for writing; `lines` has the JSON record of each finished frame by name."""
+    """Journal that is open for writing.
+
+    Attributes:
+        path: The journal file.
+        plan: Settings of the run.
+        lines: JSON record of each finished frame, by frame name.
+    """
 
     def __init__(self, path: Path, plan: dict[str, Any], lines: dict[str, str], stream: BufferedWriter) -> None:
         self.path, self.plan, self.lines = path, plan, lines
-        self._stream, self._synced = stream, monotonic()
+        self._stream, self._sync_time = stream, monotonic()
 
     def add(self, line: str) -> None:
         """Write the record of a frame."""
@@ -35,18 +41,18 @@ class Journal:
         try:
             self._stream.write(line.encode() + b"\n")
             self._stream.flush()
-            if monotonic() - self._synced > SYNC_S:
+            if monotonic() - self._sync_time > SYNC_S:
                 self.sync()
         except OSError as error:
             raise InputError(
                 f"cannot write {self.path}: {error.strerror}; finished frames are "
-                "kept, and the same command resumes the run"
+                "saved, and the same command resumes the run"
             ) from None
 
     def sync(self) -> None:
         """Flush the file to disk."""
         os.fsync(self._stream.fileno())
-        self._synced = monotonic()
+        self._sync_time = monotonic()
 
     def sort(self, names: list[str]) -> None:
         """Rewrite the file with the records in the order of names; other frames come last."""
@@ -75,16 +81,16 @@ def open_journal(
         list_files: Function that lists the other files of an earlier run, which force removes.
 
     Raises:
-        InputError: The folder has a run with different settings or other files, and force is False;
-            or another process writes into it.
+        InputError: The folder has other files or a run with different settings, and force is False;
+            or another process writes to the folder.
     """
     with lock_folder(folder):
         path = folder / JOURNAL_NAME
         lines = {} if force else _read_records(folder, plan)
-        if force and path.exists():  # without a journal, the files may not be ours
+        if force and path.exists():  # without a journal, the files may belong to another program
             for old_file in (*list_files(folder), path):
                 old_file.unlink(missing_ok=True)
-        for old_file in folder.glob(f".{JOURNAL_NAME}.*.tmp"):  # left by a process that was killed
+        for old_file in folder.glob(f".{JOURNAL_NAME}.*.tmp"):  # these files remain if a process is killed
             old_file.unlink()
         write_text(path, "\n".join([_format_head(plan), *lines.values()]))
         stream = open(path, "ab")
@@ -93,12 +99,12 @@ def open_journal(
             yield journal
         finally:
             for close_step in (journal.sync, stream.close):
-                with suppress(OSError):  # the disk is full, which add() has reported
+                with suppress(OSError):  # add() has already reported that the disk is full
                     close_step()
 
 
 def read_skipped_frames(folder: Path) -> dict[str, str]:
-    """Return the reasons for skipped frames by frame name; {} if the folder has no run."""
+    """Return the reason for each skipped frame, by frame name; {} if the folder has no run."""
     with suppress(OSError, ValueError, TypeError):
         lines = (folder / JOURNAL_NAME).read_text(errors="replace").splitlines()[1:]
         records = [json.loads(line) for line in lines if '"skipped"' in line]
@@ -111,29 +117,30 @@ def _format_head(plan: dict[str, Any]) -> str:
 
 
 def _read_records(folder: Path, plan: dict[str, Any]) -> dict[str, str]:
-    """Read the records of an earlier run with the same plan; {} if there is no such run."""
+    """Read the records of an earlier run with the same plan; return {} if the folder is empty."""
     path = folder / JOURNAL_NAME
     if not path.exists():
         if any(not path_in_folder.name.startswith(f".{JOURNAL_NAME}.") for path_in_folder in folder.iterdir()):
             raise InputError(
-                f"{folder} exists already and has no run of this command; give "
-                "another name, or --force to write into it"
+                f"{folder} already exists and has no run of this command; give "
+                "another name, or --force to write to this folder"
             )
         return {}
     try:
         header, *record_lines = path.read_text(errors="replace").split("\n")
         recorded_plan = json.loads(header)["plan"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"cannot read {path}: {error!r}; --force starts again") from None
+        raise InputError(f"cannot read {path}: {error!r}; use --force to start again") from None
     if differences := find_differences(recorded_plan, json.loads(json.dumps(plan))):
         raise InputError(
-            f"{folder} was begun with {'; '.join(differences)}; give another name, or start again with --force"
+            f"{folder} has a run with other settings ({'; '.join(differences)}); give another name, or use --force to "
+            "start again"
         )
     return {record["frame"]: line for line in record_lines if (record := _parse_record(line))}
 
 
 def _parse_record(line: str) -> dict | None:
-    """Return the record in a line; None if the line is incomplete or the frame was skipped."""
+    """Parse a record; return None if the line is incomplete or the frame was skipped."""
     with suppress(ValueError):
         record = json.loads(line)
         if isinstance(record, dict) and "frame" in record and "skipped" not in record:

@@ -1,4 +1,4 @@
-"""Processor properties of this machine."""
+"""Properties of this machine's processor."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def count_cores() -> int:
 
 @cache
 def has_bf16() -> bool:
-    """Return True if the processor has bf16 instructions, which make networks twice as fast."""
+    """Return True if the processor has bf16 instructions, with which networks are twice as fast."""
     try:
         flags = Path("/proc/cpuinfo").read_text().partition("flags")[2].partition("\n")[0].split()
     except OSError:

@@ -1,6 +1,6 @@
-"""Processing of many items in several processes that end with their parent process.
+"""Processing of many items in several processes, which end with their parent process.
 
-They also end after ctrl-C, if the parent is killed, and if memory runs out.
+They also end after ctrl-C, if the parent is killed, or if memory runs out.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from typing import Any, cast
 from lidar_perception.runs.threads import limit_to_one_thread
 from lidar_perception.types import InputError
 
-EXIT_TIMEOUT_S = 30.0  # time for processes to end when asked to
-RUNS_PER_PROCESS = 16  # runs of consecutive items, which often share work (scans of one street)
+EXIT_TIMEOUT_S = 30.0  # time for processes to end after they were told to terminate
+# Number of runs of consecutive items per process. Such items often share work, like scans of one street.
+RUNS_PER_PROCESS = 16
 
 
 def run_in_processes(
@@ -35,8 +36,8 @@ def run_in_processes(
 ) -> Generator:
     """Yield start()(item) for all items, in the order in which they are finished.
 
-    Processes are forked from a process that has only imported the modules of `start`. If there are
-    several, each uses one thread. All of them end with the iterator.
+    Processes are forked from a process that has only imported the modules of `start`. Several
+    processes use one thread each. All processes end with the iterator.
 
     Args:
         start: Picklable function that is called once in each new process and returns the function
@@ -71,9 +72,9 @@ def run_in_processes(
 
 
 def deal_items(items: Sequence, jobs: int, job: int) -> list:
-    """Return the items of one job: runs of consecutive items, dealt to the jobs in turn.
+    """Return the items of one job: runs of consecutive items, which are dealt to the jobs in turn.
 
-    The jobs differ by at most one run, which is at most 1 / RUNS_PER_PROCESS of the items of a job.
+    The jobs differ by at most one run, at most 1 / RUNS_PER_PROCESS of the items of a job.
     """
     run_length = max(1, len(items) // (jobs * RUNS_PER_PROCESS))
     return [
@@ -88,8 +89,8 @@ def run_in_order(
 ) -> Generator:
     """Yield start()(item) for all items in their order; the items may be endless.
 
-    The arguments are those of run_in_processes, but a single job also gets a new process with one
-    thread.
+    Other arguments are as in run_in_processes, but even a single job runs in a new process, with
+    one thread.
 
     Args:
         max_ahead: Maximum number of items that each process works ahead of the caller.
@@ -120,10 +121,10 @@ def _make_context(start: Callable) -> ForkServerContext:
 
 
 def _start_process(context: ForkServerContext, target: Callable, *args: Any) -> ForkServerProcess:
-    """Start a process that runs work(*args). The last argument is the end of its pipe.
+    """Start a process that runs target(*args); the last argument is its end of a pipe.
 
-    No other process keeps this end open, so the pipe closes when the process ends, even if the
-    process is killed while it sends a result.
+    No other process keeps this end open, so the pipe closes when the process ends, even if it is
+    killed while it sends a result.
     """
     process = context.Process(target=target, args=args, daemon=True)
     with _block_interrupts():
@@ -140,7 +141,7 @@ def _end_processes(process_by_pipe: dict[Connection, ForkServerProcess]) -> None
     deadline = monotonic() + EXIT_TIMEOUT_S
     for process in process_by_pipe.values():
         process.join(max(0.0, deadline - monotonic()))
-        process.kill()  # if it has not ended, for example because it was interrupted holding a lock
+        process.kill()  # in case the process has not ended, for example because it holds a lock
         process.join()
 
 
@@ -158,7 +159,7 @@ def _find_modules(work: Any) -> set[str]:
 def _receive_result(
     receiver: Connection, process_by_pipe: dict[Connection, ForkServerProcess], work_done: str
 ) -> Iterator:
-    """Yield the next result, or nothing if the process has ended normally.
+    """Receive a result; yield it, or nothing if the process has ended normally.
 
     Raises:
         InputError: The process failed or died.
@@ -179,8 +180,8 @@ def _receive_result(
     yield result
 
 
-def _run_items(start: Callable, items: Sequence, shared: bool, sender: Connection) -> None:
-    if shared:
+def _run_items(start: Callable, items: Sequence, one_thread: bool, sender: Connection) -> None:
+    if one_thread:
         limit_to_one_thread()
     parent = multiprocessing.parent_process()
     with suppress(BrokenPipeError):  # the reader has ended
@@ -196,7 +197,7 @@ def _run_items(start: Callable, items: Sequence, shared: bool, sender: Connectio
 
 def _send_item(pipe: Connection, item: Any) -> Connection:
     """Send an item through a pipe and return the pipe."""
-    with suppress(OSError):  # the process has ended, which _receive_result reports
+    with suppress(OSError):  # _receive_result reports that the process has ended
         pipe.send(item)
     return pipe
 
@@ -219,25 +220,25 @@ def _serve_items(start: Callable, pipe: Connection) -> None:
 
 
 def _exit_once(*_: Any) -> None:
-    """Exit on the first SIGTERM and ignore further ones, so that system resources are released."""
+    """Exit on the first SIGTERM and ignore later ones, so that system resources are released."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     sys.exit()
 
 
 def _send_results(results: SimpleQueue[Any], pipe: Connection) -> None:
-    """Send results; this runs in a thread because the reader may be busy for a long time."""
+    """Send results to the parent; this runs in a thread because the parent may be busy for a long time."""
     while True:
         try:
             pipe.send_bytes(results.get())
         except OSError:
-            os.kill(os.getpid(), signal.SIGTERM)  # the reader has ended
+            os.kill(os.getpid(), signal.SIGTERM)  # the parent has ended
             return
 
 
 @contextmanager
 def _block_interrupts() -> Iterator[None]:
-    """Block SIGINT, so that processes started in the block ignore ctrl-C; their parent ends them."""
-    resource_tracker.ensure_running()  # must not start inside the block, because it would unblock the signals
+    """Block SIGINT, so that processes started in the block ignore ctrl-C and are ended by their parent."""
+    resource_tracker.ensure_running()  # if it started inside the block, it would unblock the signals
     previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -1,9 +1,9 @@
 """Data set folder that is written frame by frame and can be resumed after an interruption.
 
 While it is incomplete, the folder has a JSON file INCOMPLETE with the settings, and a folder .parts
-with one file per finished frame. This file has the frame's part of each file that belongs to many
-frames, such as the label file of a sequence. At the end the parts are joined, INCOMPLETE is renamed
-to dataset.json, and .parts is removed.
+with one file per finished frame. Such a file contains what the frame adds to files of many frames,
+such as the label file of a sequence. At the end these parts are joined, INCOMPLETE is renamed to
+dataset.json, and .parts is removed.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ def make_resumable_folder(
 ) -> Iterator[list[int]]:
     """Yield the numbers of the frames that remain to be written.
 
-    The caller calls finish_frame() after each frame. After the block the folder is complete; after
-    an exception in the block it can be resumed.
+    The caller must call finish_frame() after each frame. After the block the folder is complete;
+    after an exception in the block it can be resumed.
 
     Args:
         folder: The folder.
         settings: Settings of the data set; settings["frames"] is the number of frames.
-        names: Names of the files and folders of the data set; force replaces them.
+        names: Names of the files and folders of the data set, which force replaces.
         resume: Continue an interrupted run.
         force: Replace an existing data set.
 
@@ -82,14 +82,15 @@ def _prepare_folder(folder: Path, settings: dict, names: Iterable[str], resume: 
     exists = any(folder.iterdir())
     is_own = (folder / INCOMPLETE_NAME).is_file() or (folder / RECORD_NAME).is_file()
     if exists and not (resume or force):
-        raise InputError(f"{folder} exists already; give another name" + (", --resume or --force" if is_own else ""))
+        raise InputError(f"{folder} already exists; give another name" + (", --resume or --force" if is_own else ""))
     if exists and not is_own:
-        raise InputError(f"{folder} is not a simulated data set, so it is left as it is; give another name")
+        raise InputError(f"{folder} is not a simulated data set, so it is not overwritten; give another name")
     if exists and resume:
         _check_settings(folder, settings)
         return
     refuse_other_files(folder, (*names, INCOMPLETE_NAME, RECORD_NAME, PARTS_NAME))
-    write_text(folder / INCOMPLETE_NAME, "{}")  # if interrupted during removal, only force accepts the folder
+    # If the removal is interrupted, the empty settings make sure that only force accepts the folder.
+    write_text(folder / INCOMPLETE_NAME, "{}")
     for path in folder.iterdir():
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -104,24 +105,26 @@ def _check_settings(folder: Path, settings: dict) -> None:
         recorded = json.loads(path.read_text())
         differences = find_differences(recorded, {k: v for k, v in settings.items() if k != "command"})
     except (OSError, ValueError, AttributeError) as error:
-        raise InputError(f"cannot read {path}: {error}; --force starts again") from None
+        raise InputError(f"cannot read {path}: {error}; use --force to start again") from None
     if not recorded:
-        raise InputError(f"{folder} was stopped while --force removed what was there; start again with --force")
+        raise InputError(f"{folder} is incomplete because --force was interrupted; start again with --force")
     if differences:
         raise InputError(
-            f"{folder} was begun with {'; '.join(differences)}; resume it with the same "
-            "arguments, or start again with --force"
+            f"{folder} was written with other settings ({'; '.join(differences)}); resume it with the same "
+            "arguments, or use --force to start again"
         )
 
 
 def _join_parts(folder: Path, frames: int) -> None:
-    """Write the files that belong to many frames by joining the parts."""
+    """Join the parts of all frames, and write the files that belong to many frames."""
     texts_by_name: dict[str, list[str]] = {}
     for i in range(frames):
         try:
             parts = json.loads(_part_path(folder, i).read_text())
         except (OSError, ValueError) as error:
-            raise InputError(f"cannot read {_part_path(folder, i)}: {error}; remove it and --resume") from None
+            raise InputError(
+                f"cannot read {_part_path(folder, i)}: {error}; remove it and run again with --resume"
+            ) from None
         for name, text in parts.items():
             texts_by_name.setdefault(name, []).append(text)
     for name, texts in texts_by_name.items():

@@ -1,4 +1,4 @@
-"""Locks and comparison of settings, for output folders of resumable commands."""
+"""Locks and comparison of settings for the output folders of resumable commands."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def lock_file(descriptor: int, path: Path) -> str:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise InputError(f"another process is writing {path}; wait for it or end it") from None
+        raise InputError(f"another process is writing to {path}; wait until it ends, or end it") from None
     except OSError as error:
         return error.strerror or str(error)
     return ""
@@ -34,25 +34,25 @@ def lock_file(descriptor: int, path: Path) -> str:
 def lock_folder(folder: Path) -> Iterator[None]:
     """Create a folder if needed, and lock it against other processes within the block.
 
-    After an error, folders that were created here and are still empty are removed.
+    After an error, folders are removed if they were created here and are still empty.
 
     Raises:
         InputError: The folder cannot be created, or another process has locked it.
     """
-    created = [path for path in (folder, *folder.parents) if not path.exists()]
+    new_folders = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except FileExistsError:
         raise InputError(f"{folder} is a file; give another name") from None
     except OSError as error:
-        raise InputError(f"cannot make the folder {folder}: {error.strerror}") from None
+        raise InputError(f"cannot create the folder {folder}: {error.strerror}") from None
     try:
         lock_file(descriptor, folder)
         yield
     except BaseException:
         with suppress(OSError):
-            for path in created:
+            for path in new_folders:
                 path.rmdir()
         raise
     finally:
@@ -60,9 +60,9 @@ def lock_folder(folder: Path) -> Iterator[None]:
 
 
 def find_differences(recorded: dict[str, Any], requested: dict[str, Any]) -> list[str]:
-    """Describe the settings that differ, such as "frames 5, not 6".
+    """Describe each setting that differs, such as "frames 5, not 6".
 
-    Settings in nested dicts have dotted names. Keys that are only in `recorded` are ignored.
+    Settings in nested dicts have dotted names. Settings that are only in `recorded` are ignored.
 
     Args:
         recorded: Settings of the earlier run.

@@ -28,10 +28,10 @@ from lidar_perception.types import InputWarning
 
 
 class Terminal(Console):
-    """Console without markup, because text can contain file names.
+    """Console that prints text without interpreting markup, because text can contain file names.
 
-    Lines are wrapped and tables are fitted to the width only on a terminal. Output to a file or a
-    pipe is never wrapped or cut.
+    On a terminal, lines are wrapped and tables are fitted to its width. Output to a file or a pipe
+    is never wrapped or cut.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -54,13 +54,13 @@ class Terminal(Console):
 
 
 def _split_title(table: Table) -> list[list[Any]]:
-    """Separate a table from its title, because rich wraps the title at the width of the table."""
+    """Separate the title of a table from the table, because rich wraps it at the width of the table."""
     table_without_title = copy.copy(table)
     table_without_title.title = None
     return [[part] for part in (table.title, table_without_title) if part is not None]
 
 
-MAX_WIDTH = 100_000  # in characters, wider than any table
+MAX_WIDTH = 100_000  # width of output to a file or pipe in characters, wider than any table
 
 console = Terminal()
 errors = Terminal(stderr=True)
@@ -68,7 +68,7 @@ errors = Terminal(stderr=True)
 
 @contextmanager
 def show_input_warnings() -> Iterator[None]:
-    """Print each InputWarning once, as a single line on standard error."""
+    """Print each InputWarning in the block once, as a single line on standard error."""
     with warnings.catch_warnings():
         warnings.filterwarnings("once", category=InputWarning)
         default_show = warnings.showwarning
@@ -83,7 +83,7 @@ def show_input_warnings() -> Iterator[None]:
         yield
 
 
-LOG_INTERVAL_S = 15.0  # time between progress lines without a terminal
+LOG_INTERVAL_S = 15.0  # time between progress lines if standard error is not a terminal
 
 
 def make_progress() -> Progress:
@@ -106,7 +106,7 @@ def make_progress() -> Progress:
 
 
 class _LineProgress(Progress):
-    """Progress printed as lines; rich is used only to compute the speed."""
+    """Progress display that prints lines; rich is used only to compute the remaining time."""
 
     last_line = 0.0
 
@@ -139,8 +139,8 @@ class _LineProgress(Progress):
 
 
 def show_scanning(path: Path) -> Status:
-    """Show a status line while the times of all frames are read; this can take minutes for a bag."""
-    return errors.status(Text(f"looking through {path}"))
+    """Show a status line while the times of all frames are read, which can take minutes for a bag."""
+    return errors.status(Text(f"reading the times of the frames in {path}"))
 
 
 @contextmanager
@@ -157,7 +157,7 @@ def pause_progress(bar: Progress) -> Iterator[None]:
 
 
 def show_progress(items: Iterable, description: str, total: int) -> Iterator:
-    """Iterate over `total` items and show the progress."""
+    """Yield `total` items and show the progress."""
     with make_progress() as bar:
         yield from bar.track(items, total=total, description=description)
 

@@ -1,4 +1,4 @@
-"""Thread settings of numerical libraries, for machines whose cores are shared."""
+"""Thread settings of numerical libraries for machines on which processes share the cores."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import sys
 from lidar_perception.runs.machine import count_cores
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-# Variables of the OpenMP standard and of GNU's OpenMP. Threads spin this often before they sleep,
-# because the next layer of a network follows within microseconds.
+# Settings of OpenMP with which idle threads sleep after a short spin. They spin at all because the next
+# layer of a network follows within microseconds; GOMP_SPINCOUNT is specific to GNU's OpenMP.
 PASSIVE_WAITING = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "1000"}
 
 _thread_count = 0  # 0 if not set
 
 
 def set_thread_count(count: int) -> None:
-    """Set the number of threads that networks use in compiled kernels and in torch."""
+    """Set the number of threads with which networks run in compiled kernels and in torch."""
     global _thread_count
     _thread_count = count
     set_torch_threads()
@@ -30,26 +30,28 @@ def set_torch_threads() -> None:
 
 
 def get_thread_count() -> int:
-    """Return the number of threads that networks use.
+    """Return the number of threads with which networks run.
 
-    It is the count of set_thread_count(), or else OMP_NUM_THREADS, or else the number of cores.
+    It is the first of these that is set: the count of set_thread_count(), OMP_NUM_THREADS, and the
+    number of cores.
     """
     omp_threads = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
-    return _thread_count or (int(omp_threads) if omp_threads.isdigit() else 0) or (count_cores())
+    return _thread_count or (int(omp_threads) if omp_threads.isdigit() else 0) or count_cores()
 
 
 def use_passive_waiting() -> None:
     """Make idle OpenMP threads sleep after a short spin. Call this before torch is loaded.
 
-    Settings of the user in the environment are kept. NumPy's OpenBLAS has no such setting and is
-    not faster with threads for matrices of three columns, so it gets one thread.
+    Settings of the user in the environment take precedence. NumPy's OpenBLAS has no such setting,
+    and for matrices of three columns it is not faster with several threads, so it gets one thread.
 
-    Duration of the detector `fused` on two cores:
+    Run time of the detector `fused` on two cores, if the cores are free or shared with two busy
+    processes:
 
-        idle threads                 two free cores    two busy processes
-        spin shortly, then sleep         102 ms              230 ms
-        sleep at once                    120 ms              245 ms
-        spin                              96 ms              339 ms
+        idle threads                 free cores    shared cores
+        spin shortly, then sleep       102 ms         230 ms
+        sleep at once                  120 ms         245 ms
+        spin                            96 ms         339 ms
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if not PASSIVE_WAITING.keys() & os.environ.keys():
@@ -57,11 +59,11 @@ def use_passive_waiting() -> None:
 
 
 def default_to_one_thread() -> None:
-    """Set the default of each library to one thread, for processes that share few cores.
+    """Set the default number of threads of each library to one, for processes that share few cores.
 
     Threads of linear algebra libraries spin while they wait. set_thread_count() can give torch more
     threads, which sleep while idle. Call this before the libraries are loaded. Settings of the user
-    in the environment are kept.
+    in the environment take precedence.
     """
     for variable in THREAD_VARIABLES:
         os.environ.setdefault(variable, "1")
@@ -71,8 +73,8 @@ def default_to_one_thread() -> None:
 def limit_to_one_thread() -> None:
     """Limit each library in this process to one thread, even if the user has set another number.
 
-    The limit also applies to libraries that are not loaded yet. Two processes on two free cores
-    prepare 35 scenes per second; with two threads for matrices in each process it is 8.
+    The limit also applies to libraries that are loaded later. Two processes on two free cores
+    prepare 35 scenes per second with this limit, and 8 with two threads each.
     """
     from threadpoolctl import threadpool_limits  # imported here to keep commands fast
 

@@ -36,21 +36,21 @@ def make_frames(
         clouds: Arrays (N, 3) [x y z] in metres, or (N, 4) with intensity 0..1, in the sensor frame.
         labels: Labels of each cloud: GroundTruth, pairs (class name, [x y z l w h yaw]), or None
             for an unlabelled cloud.
-        frame_id: Frame of the clouds.
+        frame_id: Coordinate frame of the clouds.
         hz: Number of clouds per second.
         start_ns: Stamp of the first cloud.
 
     Raises:
-        InputError: An array has another shape, or the numbers of clouds and labels differ.
+        InputError: An array has a wrong shape, or the numbers of clouds and labels differ.
     """
     clouds = [np.asarray(cloud, np.float32) for cloud in clouds]
     truths = [None] * len(clouds) if labels is None else [*map(_to_truth, labels)]
     if len(truths) != len(clouds):
-        raise InputError(f"{len(clouds)} clouds and labels of {len(truths)}; give one each")
+        raise InputError(f"{len(clouds)} clouds, but labels for {len(truths)}; give one item of labels per cloud")
     frames = []
     for i, (cloud, truth) in enumerate(zip(clouds, truths)):
         if cloud.ndim != 2 or cloud.shape[1] not in (3, 4):
-            raise InputError(f"cloud {i} has shape {cloud.shape}; it must be (N, 3) or (N, 4)")
+            raise InputError(f"cloud {i} has shape {cloud.shape}, expected (N, 3) or (N, 4)")
         intensity = cloud[:, 3].copy() if cloud.shape[1] == 4 else None
         frames.append(
             Frame.of(
@@ -67,9 +67,9 @@ def _to_truth(labels: Any) -> GroundTruth | None:
         return labels
     objects = to_objects(labels)
     if unknown_classes := [name for name in objects.labels if name not in CLASSES]:
-        raise InputError(f"labels: '{unknown_classes[0]}' is none of {', '.join(CLASSES)}")
+        raise InputError(f"labels: unknown class '{unknown_classes[0]}'; choose from {', '.join(CLASSES)}")
     if np.isnan(objects.boxes).any():
-        raise InputError("labels need complete boxes [x y z l w h yaw]")
+        raise InputError("labels need complete boxes [x y z l w h yaw], not only centres")
     return GroundTruth.of(objects.boxes, [CLASSES.index(name) for name in objects.labels])
 
 
@@ -95,13 +95,16 @@ def write_rosbags_bag(
 def copy_bag(source: Path, path: Path, storage: str, names: Mapping[str, str] = {}) -> Path:
     """Copy a bag with rosbags; for arguments and errors see write_rosbags_bag."""
     if storage not in STORAGES:
-        raise InputError(f"storage '{storage}' is none of {', '.join(STORAGES)}")
+        raise InputError(f"unknown storage '{storage}'; choose from {', '.join(STORAGES)}")
     with Bag(source) as source_bag, Writer(path, version=9, storage_plugin=STORAGES[storage]) as bag:
         connections = {
             topic: bag.add_connection(
-                names.get(topic, topic), kind, typestore=load_typestore(), offered_qos_profiles=source_bag.qos(topic)
+                names.get(topic, topic),
+                type_name,
+                typestore=load_typestore(),
+                offered_qos_profiles=source_bag.qos(topic),
             )
-            for topic, kind in source_bag.topics.items()
+            for topic, type_name in source_bag.topics.items()
         }
         for topic, stamp, data in source_bag.raw_messages():
             bag.write(connections[topic], stamp, data)
@@ -109,17 +112,17 @@ def copy_bag(source: Path, path: Path, storage: str, names: Mapping[str, str] = 
 
 
 def to_frames(frames: Sequence[Any] | Iterable[Frame], labels: Any = None, **options: Any) -> list[Frame]:
-    """Return frames unchanged, or convert clouds with make_frames().
+    """Convert clouds to frames with make_frames(); frames are returned unchanged.
 
     Raises:
-        InputError: There are labels or options together with frames; they would be ignored.
+        InputError: Labels or options are given together with frames, which have their own.
     """
     frames = list(frames)
     if not frames or not isinstance(frames[0], Frame):
         return make_frames(frames, labels, **options)
     if rejected := [*(() if labels is None else ("labels",)), *options]:
         raise InputError(
-            f"frames already have labels, times and a frame_id, so they take no "
-            f"{' and no '.join(rejected)}; give arrays instead"
+            f"frames already have labels, times and a frame_id; leave out {' and '.join(rejected)}, or "
+            "give arrays instead of frames"
         )
     return frames

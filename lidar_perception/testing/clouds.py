@@ -24,11 +24,11 @@ def make_cloud_message(points: Any, stamp_ns: int = 1, frame_id: str = "lidar", 
         columns: Additional fields (N, ...) such as ground or ring, written with their own dtypes.
 
     Raises:
-        InputError: `points` has another shape.
+        InputError: `points` has a wrong shape.
     """
     points = np.asarray(points, np.float32)
     if points.ndim != 2 or points.shape[1] not in (3, 4):
-        raise InputError(f"a cloud of shape {points.shape}; it must be (N, 3) or (N, 4)")
+        raise InputError(f"the cloud has shape {points.shape}, expected (N, 3) or (N, 4)")
     values = dict(zip(FIELDS, points.T)) | columns
     cloud = np.zeros(len(points), [(k, v.dtype, v.shape[1:]) for k, v in values.items()])
     for name, column in values.items():

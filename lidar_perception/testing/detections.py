@@ -13,16 +13,17 @@ from lidar_perception.types import CLASSES, InputError
 from msg_utils.detections import from_detection_array
 from msg_utils.markers import from_marker_array
 
-__tracebackhide__ = True  # so that pytest shows the line in the test
+__tracebackhide__ = True  # makes pytest show the line in the test
 
-MAX_LISTED = 20  # maximum number of missing and of extra objects to list
+MAX_LISTED = 20  # maximum number of missing objects, and of extra objects, in an error message
 
 
 class Objects(NamedTuple):
     """K detected or expected objects.
 
     Attributes:
-        boxes: (K, 7) float64 [x y z l w h yaw]; NaN after the centre if only the centre is given.
+        boxes: (K, 7) float64 [x y z l w h yaw]; if only the centre is given, the other values are
+            NaN.
         labels: K class names.
         scores: (K,) float64, 1 for objects without a score.
     """
@@ -74,7 +75,7 @@ def _from_pairs(pairs: Any) -> Objects:
 
 
 def assert_detections(
-    found: Any,
+    detections: Any,
     expected: Any,
     *,
     max_distance: float = MAX_CENTRE_DISTANCE,
@@ -85,10 +86,11 @@ def assert_detections(
 ) -> list[tuple[int, int]]:
     """Assert that detections match the expected objects.
 
-    Detections and objects are matched one to one: as many pairs as possible, then the closest ones.
+    Detections and objects are matched one to one, such that the number of pairs is as large as
+    possible, and then their total distance as small as possible.
 
     Args:
-        found: Detections of any type that to_objects() accepts.
+        detections: Detections of any type that to_objects() accepts.
         expected: Expected objects of any type that to_objects() accepts.
         max_distance: Maximum distance between the centres of a pair, metres.
         min_iou: Minimum 3D IoU of a pair; if given, it replaces max_distance.
@@ -97,40 +99,40 @@ def assert_detections(
         max_extra: Maximum number of detections without an object, None for any number.
 
     Returns:
-        (index into found, index into expected) of each pair.
+        (index into detections, index into expected) of each pair.
 
     Raises:
         AssertionError: Too many objects are missing or extra; the message lists them.
     """
-    detected, expected_objects = to_objects(found), to_objects(expected)
+    detected_objects, expected_objects = to_objects(detections), to_objects(expected)
     if min_iou is not None and not np.isfinite(expected_objects.boxes).all():
         raise InputError("min_iou needs complete boxes; some expected objects have only a centre")
-    distance = np.linalg.norm(detected.boxes[:, None, :3] - expected_objects.boxes[None, :, :3], axis=2)
+    distance = np.linalg.norm(detected_objects.boxes[:, None, :3] - expected_objects.boxes[None, :, :3], axis=2)
     if min_iou is None:
         cost, can_match = distance, distance <= max_distance
     else:
-        overlap = iou_3d(detected.boxes, expected_objects.boxes)
+        overlap = iou_3d(detected_objects.boxes, expected_objects.boxes)
         cost, can_match = 1 - overlap, (overlap >= min_iou) & (overlap > 0)
     if same_class:
         can_match &= np.array(
             [
-                [detected_label == wanted_label for wanted_label in expected_objects.labels]
-                for detected_label in detected.labels
+                [detected_label == expected_label for expected_label in expected_objects.labels]
+                for detected_label in detected_objects.labels
             ],
             bool,
         ).reshape(can_match.shape)
     rows, columns = assign_pairs(cost, can_match)
     missing_rows = sorted(set(range(len(expected_objects.boxes))) - set(columns.tolist()))
-    extra_rows = sorted(set(range(len(detected.boxes))) - set(rows.tolist()))
+    extra_rows = sorted(set(range(len(detected_objects.boxes))) - set(rows.tolist()))
     if len(missing_rows) > max_missing or (max_extra is not None and len(extra_rows) > max_extra):
         rule = f"centres at most {max_distance:g} m apart" if min_iou is None else f"3D IoU at least {min_iou:g}"
         raise AssertionError(
             "\n".join(
                 [
-                    f"{len(rows)} of {len(expected_objects.boxes)} expected objects were found, "
-                    f"{len(extra_rows)} more were found ({rule}{', of the same class' if same_class else ''})",
-                    *_list_objects("missing", expected_objects, missing_rows, detected, distance.T),
-                    *_list_objects("extra", detected, extra_rows, expected_objects, distance),
+                    f"{len(rows)} of {len(expected_objects.boxes)} expected objects were detected, "
+                    f"and {len(extra_rows)} extra objects ({rule}{', of the same class' if same_class else ''})",
+                    *_list_objects("missing", expected_objects, missing_rows, detected_objects, distance.T),
+                    *_list_objects("extra", detected_objects, extra_rows, expected_objects, distance),
                 ]
             )
         )
@@ -138,7 +140,7 @@ def assert_detections(
 
 
 def _list_objects(word: str, objects: Objects, rows: Sequence[int], others: Objects, distance: np.ndarray) -> list[str]:
-    """Return one line for each of the rows, with the nearest object of `others`."""
+    """Describe the objects in the given rows, one per line, each with the nearest of the others."""
     lines = []
     for i in rows[:MAX_LISTED]:
         box = objects.boxes[i]

@@ -1,4 +1,4 @@
-"""pytest fixtures, and a hook that adds the logs of the nodes to the report of a failed test."""
+"""pytest fixtures, and a hook that adds the logs of nodes to the report of a failed test."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 NEEDS_ROS = "needs ROS 2, or the extra [ros]"
-FRAMES = 8  # number of frames of drive_bag
+FRAME_COUNT = 8  # number of frames in drive_bag
 
 
 @pytest.fixture(scope="session")
@@ -28,7 +28,7 @@ def domain() -> Iterator[int]:
         patch.setenv("ROS_DOMAIN_ID", str(number))
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         use_large_shared_memory()
-        warm_up()  # on a fresh machine, compilation in a node could take longer than a wait
+        warm_up()  # compile here, because compilation in a node could take longer than a timeout
         yield number
 
 
@@ -49,19 +49,19 @@ def _peer(domain: int, processes: Any) -> Iterator[Any]:
 
 @pytest.fixture
 def processes(domain, tmp_path) -> Iterator[Any]:
-    """NodesUnderTest: starts nodes and programs, and stops them at the end of the test."""
+    """NodesUnderTest object that starts nodes and programs, and stops them at the end of the test."""
     yield from _processes(domain, tmp_path / "logs")
 
 
 @pytest.fixture
 def peer(domain, processes) -> Iterator[Any]:
-    """Peer: a node that subscribes, publishes and waits."""
+    """Peer object: a node that subscribes, publishes and waits."""
     yield from _peer(domain, processes)
 
 
 @pytest.fixture(scope="module")
 def shared_processes(domain, tmp_path_factory) -> Iterator[Any]:
-    """`processes` shared by all tests of a module, because starting nodes takes long."""
+    """`processes` shared by all tests of a module, because it takes long to start nodes."""
     yield from _processes(domain, tmp_path_factory.mktemp("logs"))
 
 
@@ -75,8 +75,8 @@ def shared_peer(domain, shared_processes) -> Iterator[Any]:
 def make_bag(tmp_path_factory) -> Callable[..., Path]:
     """Function that writes a bag: make_bag(clouds, labels=None, storage="mcap", points="/points").
 
-    For clouds, labels and other options see bags.make_frames. Instead of clouds, frames can be
-    given, such as simulated ones.
+    For clouds, labels and other options see bags.make_frames. Frames, such as simulated ones, can
+    be given instead of clouds.
     """
 
     def make(
@@ -98,7 +98,7 @@ def drive_bag(make_bag) -> Path:
     from lidar_perception.simulation.recording import simulate_frames
     from lidar_perception.simulation.scene import CROWDED_ZONES
 
-    return make_bag(simulate_frames(33, FRAMES, scenes=CROWDED_ZONES))
+    return make_bag(simulate_frames(33, FRAME_COUNT, scenes=CROWDED_ZONES))
 
 
 @pytest.hookimpl(wrapper=True)

@@ -1,4 +1,4 @@
-"""Nodes forked from a process with preloaded modules, because imports take most of the start."""
+"""Nodes forked from a process with preloaded modules, because imports take most of the start-up time."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-CONTEXT = multiprocessing.get_context("forkserver")  # its server starts with the first node
+CONTEXT = multiprocessing.get_context("forkserver")  # the server process starts with the first node
 CONTEXT.set_forkserver_preload(["lidar_perception.testing.preload"])
 
 
 class ForkedNode:
-    """Node in a forked process, with the interface of subprocess.Popen."""
+    """Node in a forked process, with an interface like subprocess.Popen."""
 
     def __init__(self, arguments: Sequence[str], environment: Mapping[str, str], log: Path):
         self.args = list(arguments)

@@ -1,6 +1,6 @@
-"""Support for launch_testing: launch files of this package on a private ROS domain.
+"""Support for launch_testing, to test launch files of this package on a private ROS domain.
 
-Needs launch_testing and launch_ros of ROS 2. Use Peer in the tests to wait for messages.
+It needs launch_testing and launch_ros of ROS 2. Use Peer in the tests to wait for messages.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ def include_launch_file(name: str = "detectors", **arguments: Any) -> Any:
     Example: include_launch_file(detectors="pointpillars", points="/front/points").
 
     Raises:
-        InputError: launch is not installed, ROS does not find the package, or there is no such
-            file.
+        InputError: launch is not installed, ROS does not find the package, or the launch file does
+            not exist.
     """
     try:
         from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
@@ -34,13 +34,13 @@ def include_launch_file(name: str = "detectors", **arguments: Any) -> Any:
         share_folder = Path(get_package_share_directory("lidar_perception"))
     except PackageNotFoundError:
         raise InputError(
-            "ROS does not find the package lidar_perception; source the workspace it "
-            "was built in, or add where pip installed it to AMENT_PREFIX_PATH"
+            "ROS does not find the package lidar_perception; source the workspace in which it was "
+            "built, or add the prefix in which pip installed it to AMENT_PREFIX_PATH"
         ) from None
     path = share_folder / "launch" / f"{name}.launch.py"
     if not path.is_file():
         available = ", ".join(sorted(p.name.split(".")[0] for p in path.parent.glob("*.launch.py")))
-        raise InputError(f"there is no launch file '{name}'; there are {available}")
+        raise InputError(f"unknown launch file '{name}'; choose from {available}")
     return IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(path)),
         launch_arguments=[
@@ -52,8 +52,8 @@ def include_launch_file(name: str = "detectors", **arguments: Any) -> Any:
 def make_description(*actions: Any) -> Any:
     """Make the return value of generate_test_description(): the actions, then ReadyToTest.
 
-    Also moves this process and the programs that it starts to a private ROS domain, limited to this
-    machine, so that a test never communicates with a robot.
+    This process and the programs that it starts are also moved to a private ROS domain, limited to
+    this machine, so that a test never communicates with a robot.
 
     Raises:
         InputError: launch_testing is not installed.
@@ -65,13 +65,13 @@ def make_description(*actions: Any) -> Any:
         raise _missing_package_error(error) from None
     os.environ.update(ROS_DOMAIN_ID=str(reserve_domain()), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
     use_large_shared_memory()
-    warm_up()  # on a fresh machine, compilation in a node could take longer than a wait
+    warm_up()  # compile here, because compilation in a node could take longer than a timeout
     return LaunchDescription([*actions, ReadyToTest()])
 
 
 def _missing_package_error(error: ModuleNotFoundError) -> InputError:
     package = str(error.name).partition(".")[0].replace("_", "-")
     return InputError(
-        f"{error.name} is not installed; it comes with ROS 2 (ros-jazzy-{package}); "
-        "with pytest alone see docs/how-to/test-your-stack.md"
+        f"{error.name} is not installed; install ros-jazzy-{package}, or use pytest without "
+        "launch_testing, see docs/how-to/test-your-stack.md"
     )

@@ -18,18 +18,18 @@ from msg_utils.messages import load_message_class
 
 __tracebackhide__ = True  # so that pytest shows the line in the test
 
-TIMEOUT_S = 120.0  # the first start on a machine compiles code, and the machine may be busy
+TIMEOUT_S = 120.0  # default timeout; long, because nodes compile code at their first start on a machine
 LEVELS = {0: "OK", 1: "WARN", 2: "ERROR", 3: "STALE"}
 
 
 class Peer(ExternalNode):
-    """Context manager with a node on a ROS domain, by default that of the environment.
+    """Context manager with a node on a ROS domain, by default the domain in the environment.
 
-    If a wait fails, it raises an AssertionError that describes the received messages. It fails
-    after the timeout, or at once if one of `processes` has ended with an error.
+    A wait fails after the timeout, or at once if one of `processes` has ended with an error. Then
+    it raises an AssertionError that describes the received messages.
 
-    Message types are names such as "std_msgs/msg/Bool", or classes. Received messages are of a
-    rosbags class, with NumPy arrays, if rosbags knows the type; otherwise of an rclpy class.
+    Message types are names such as "std_msgs/msg/Bool", or classes. Received messages are objects
+    of rosbags, with NumPy arrays, if rosbags knows their type, and otherwise of rclpy.
     """
 
     def __init__(self, domain: int | None = None, processes: NodesUnderTest | None = None):
@@ -37,15 +37,15 @@ class Peer(ExternalNode):
         self.processes = processes
         self.received: list[tuple[str, list]] = []  # topic and messages of each subscription
 
-    def listen(self, topic: str, kind: str | type, qos: QoSProfile = RELIABLE) -> list:
+    def listen(self, topic: str, message_type: str | type, qos: QoSProfile = RELIABLE) -> list:
         """Subscribe to a topic; return a list to which its messages are appended."""
-        name, cls = _resolve_type(kind)
+        name, cls = _resolve_type(message_type)
         is_known = name in load_typestore().fielddefs
         return self._listen(topic, cls, (lambda data: decode(data, name)) if is_known else None, qos)
 
-    def listen_raw(self, topic: str, kind: str | type, qos: QoSProfile = RELIABLE) -> list[bytes]:
+    def listen_raw(self, topic: str, message_type: str | type, qos: QoSProfile = RELIABLE) -> list[bytes]:
         """Subscribe to a topic; return a list to which its serialized messages are appended."""
-        return self._listen(topic, _resolve_type(kind)[1], bytes, qos)
+        return self._listen(topic, _resolve_type(message_type)[1], bytes, qos)
 
     def _listen(self, topic: str, cls: type, read: Callable[[bytes], Any] | None, qos: QoSProfile) -> list:
         received: list = []
@@ -59,11 +59,11 @@ class Peer(ExternalNode):
         self.received.append((self.node.resolve_topic_name(topic), received))
         return received
 
-    def advertise(self, topic: str, kind: str | type, qos: QoSProfile = RELIABLE) -> Any:
+    def advertise(self, topic: str, message_type: str | type, qos: QoSProfile = RELIABLE) -> Any:
         """Create a publisher for send()."""
-        return self.node.create_publisher(_resolve_type(kind)[1], topic, qos)
+        return self.node.create_publisher(_resolve_type(message_type)[1], topic, qos)
 
-    def send(self, publisher: Any, message: Any, until: Callable[[], Any], what: str) -> None:
+    def send(self, publisher: Any, message: Any, condition: Callable[[], Any], description: str) -> None:
         """Publish a message every half second until a condition is true.
 
         The message is repeated because a best-effort subscriber may not have discovered the
@@ -72,28 +72,30 @@ class Peer(ExternalNode):
         Args:
             publisher: Result of advertise().
             message: Message of a rosbags or rclpy class.
-            until: Function that returns the condition.
-            what: Description of the condition for the error message.
+            condition: Function that returns True when the wait is over.
+            description: What the condition waits for, for the error message.
         """
         data = encode(message) if hasattr(message, "__msgtype__") else message
         next_time = 0.0
 
-        def condition() -> Any:
+        def publish_until_condition() -> Any:
             nonlocal next_time
             if monotonic() >= next_time and publisher.get_subscription_count():
                 publisher.publish(data)
                 next_time = monotonic() + 0.5
                 return False
-            return until()
+            return condition()
 
-        self.wait(condition, what)
+        self.wait(publish_until_condition, description)
 
-    def wait(self, condition: Callable[[], Any], what: str | Callable[[], str], timeout: float = TIMEOUT_S) -> None:
+    def wait(
+        self, condition: Callable[[], Any], description: str | Callable[[], str], timeout: float = TIMEOUT_S
+    ) -> None:
         """Spin until condition() is true.
 
         Args:
-            condition: Function that returns the condition.
-            what: Description of the condition for the error message.
+            condition: Function that returns True when the wait is over.
+            description: What the condition waits for, for the error message.
             timeout: Maximum duration in seconds.
 
         Raises:
@@ -107,13 +109,13 @@ class Peer(ExternalNode):
             return is_fulfilled or bool(self._find_failed())
 
         self.spin_until(is_over, timeout)
-        # The condition may be that the process ends.
+        # The condition may be that a process has failed.
         if is_fulfilled or (self._find_failed() and condition()):
             return
-        what = what if isinstance(what, str) else what()
+        description = description if isinstance(description, str) else description()
         if failures := ", ".join(f"{k} ended with code {v}" for k, v in self._find_failed().items()):
-            raise AssertionError(f"while the test waited for {what}, {failures}; {self.describe()}")
-        raise AssertionError(f"waited {timeout:g} s in vain for {what}; {self.describe()}")
+            raise AssertionError(f"while the test waited for {description}, {failures}; {self.describe()}")
+        raise AssertionError(f"timed out after {timeout:g} s waiting for {description}; {self.describe()}")
 
     def _find_failed(self) -> dict[str, int]:
         return self.processes.find_failed() if self.processes else {}
@@ -122,16 +124,21 @@ class Peer(ExternalNode):
         """Wait until each topic has a publisher."""
         names = [self.node.resolve_topic_name(topic) for topic in topics]
 
-        def missing() -> list[str]:
+        def list_missing() -> list[str]:
             return [name for name in names if not self.node.count_publishers(name)]
 
-        self.wait(lambda: not missing(), lambda: "publishers of " + ", ".join(missing()), timeout)
+        self.wait(lambda: not list_missing(), lambda: "publishers of " + ", ".join(list_missing()), timeout)
 
     def wait_for_messages(
-        self, topic: str, kind: str | type, count: int = 1, qos: QoSProfile = RELIABLE, timeout: float = TIMEOUT_S
+        self,
+        topic: str,
+        message_type: str | type,
+        count: int = 1,
+        qos: QoSProfile = RELIABLE,
+        timeout: float = TIMEOUT_S,
     ) -> list:
         """Subscribe to a topic, wait for `count` messages, and return the list; see listen()."""
-        received = self.listen(topic, kind, qos)
+        received = self.listen(topic, message_type, qos)
         self.wait(lambda: len(received) >= count, f"{count} messages on {topic}", timeout)
         return received
 
@@ -142,7 +149,7 @@ class Peer(ExternalNode):
 
         Args:
             node: Name of the node.
-            words: Words that the message must contain.
+            words: Text that the message must contain.
             level: 0 OK, 1 WARN, 2 ERROR, 3 STALE; None for any level.
             timeout: Maximum duration in seconds.
         """
@@ -161,10 +168,10 @@ class Peer(ExternalNode):
         self.wait(lambda: self.is_connected(outputs), f"{', '.join(graph)} to find each other", timeout)
 
     def wait_for_subscribers(self, node: str, topic: str, others: int = 0, timeout: float = TIMEOUT_S) -> None:
-        """Wait until a node of this package has discovered all subscribers of its topic.
+        """Wait until a node of this package has discovered all subscribers of a topic.
 
-        Subscribers miss messages that are published earlier. The count comes from the diagnostics
-        of the node; expected are the subscribers of this peer plus `others`.
+        Subscribers miss messages that are published earlier. The number of subscribers in the
+        diagnostics of the node must reach the number of subscribers of this peer plus `others`.
         """
         name = self.node.resolve_topic_name(topic)
         expected_count = others + sum(name == subscribed for subscribed, _ in self.received)
@@ -183,14 +190,14 @@ class Peer(ExternalNode):
         received = "; ".join(
             f"{topic} {len(messages)} messages"
             if messages
-            else f"{topic} nothing from {self.node.count_publishers(topic)} publishers"
+            else f"{topic} no messages from {self.node.count_publishers(topic)} publishers"
             for topic, messages in self.received
         )
         return f"diagnostics: {diagnostics or 'none'}" + (f"; received: {received}" if received else "")
 
-    def call(self, service: str, kind: type, request: Any) -> Any:
+    def call(self, service: str, service_type: type, request: Any) -> Any:
         """Call a service and return its response."""
-        client = self.node.create_client(kind, service)
+        client = self.node.create_client(service_type, service)
         self.wait(client.service_is_ready, f"service {service}")
         future = client.call_async(request)
         self.wait(future.done, f"answer of {service}")
@@ -198,7 +205,7 @@ class Peer(ExternalNode):
         return future.result()
 
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> list[str]:
-        """Set parameters of a node one by one; return the reason for each one that it rejects."""
+        """Set parameters of a node one by one; return the reason for each rejected parameter."""
         request = SetParameters.Request(
             parameters=[parameter.to_parameter_msg() for parameter in to_parameters(values)]
         )
@@ -209,12 +216,12 @@ class Peer(ExternalNode):
         """Set a parameter of a node.
 
         Raises:
-            AssertionError: The node rejects the value; the message has its reason.
+            AssertionError: The node rejects the value; the message contains the reason.
         """
         assert not (reasons := self.set_parameters(node, {name: value})), reasons
 
     @contextmanager
-    def parameters(self, node: str, values: Mapping[str, Any]) -> Iterator[None]:
+    def override_parameters(self, node: str, values: Mapping[str, Any]) -> Iterator[None]:
         """Set parameters of a node within a block and restore the previous values at its end."""
         request = GetParameters.Request(names=list(values))
         previous_values = to_values(self.call(f"{node}/get_parameters", GetParameters, request).values)
@@ -225,9 +232,9 @@ class Peer(ExternalNode):
             assert not self.set_parameters(node, dict(zip(values, previous_values)))
 
 
-def _resolve_type(kind: str | type) -> tuple[str, type]:
+def _resolve_type(message_type: str | type) -> tuple[str, type]:
     """Return the name and the class of a message type, given either of them."""
-    if isinstance(kind, str):
-        return kind, load_message_class(kind)
-    package, group, *_ = kind.__module__.split(".")
-    return f"{package}/{group}/{kind.__name__}", kind
+    if isinstance(message_type, str):
+        return message_type, load_message_class(message_type)
+    package, group, *_ = message_type.__module__.split(".")
+    return f"{package}/{group}/{message_type.__name__}", message_type

@@ -1,4 +1,4 @@
-"""Preloading of the modules that nodes need, in the process from which nodes are forked."""
+"""Module that loads the modules that nodes need, in the process from which nodes are forked."""
 
 from contextlib import suppress
 from importlib import import_module
@@ -8,7 +8,7 @@ from lidar_perception.runs.threads import default_to_one_thread
 
 default_to_one_thread()  # as nodes.main does
 for name in NODES:
-    with suppress(ImportError):  # reported by the node when it starts
+    with suppress(ImportError):  # the node reports it when it starts
         load_node_class(name)
 for module in ("nodes.stopping", "detectors.open"):
     with suppress(ImportError):

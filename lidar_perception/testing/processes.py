@@ -1,4 +1,4 @@
-"""Child processes of a test: nodes and other programs on one ROS domain."""
+"""Child processes of a test: nodes and other programs on a ROS domain."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from lidar_perception.param_fields import flatten
 from lidar_perception.testing.forking import ForkedNode
 from lidar_perception.wire.topics import POINTS
 
-MAX_LOG_LINES = 60  # maximum lines of each log in the report of a failed test
+MAX_LOG_LINES = 60  # maximum number of lines of each log in the report of a failed test
 
 
 class NodesUnderTest(Processes):
     """Processes whose logs are shown if a test fails while they are running.
 
     Nodes of this package are forked from a process that has imported their code. If `fresh` is
-    True, each node is instead started in a new interpreter, as in production, which takes seconds.
+    True, each node is started in a new interpreter instead, as in production, which takes seconds.
     """
 
-    active: list[NodesUnderTest] = []  # nodes of all tests that are running
+    active: list[NodesUnderTest] = []  # objects whose context is open
     fresh = False
 
     def __enter__(self) -> NodesUnderTest:
@@ -54,14 +54,15 @@ class NodesUnderTest(Processes):
 
         Args:
             detectors: Any of candidates, pointpillars and pointnet.
-            params: Dataclass or mapping with parameter values; each node gets those that it has.
-            single: Run each detector in one process. If False, ground and clusters are computed
+            params: Dataclass or mapping with parameter values; each node gets the parameters that
+                it declares.
+            single: True to run each detector in one process; False to compute ground and clusters
                 once for all detectors.
             points: Topic of the clouds, relative to the namespace unless it starts with /.
             namespace: Namespace of the nodes.
 
         Returns:
-            Remappings of each node.
+            The remappings of each node.
         """
         values = {} if params is None else (params if isinstance(params, Mapping) else flatten(params))
         graph = {
@@ -77,8 +78,8 @@ class NodesUnderTest(Processes):
 
         Args:
             bag: The bag to play.
-            follow: Topics of detections. The next cloud is sent after the detections of the
-                previous ones have arrived there, so that no cloud is lost on a slow machine.
+            follow: Topics of detections. The next cloud is sent when the detections of the previous
+                clouds have arrived there, so that no cloud is lost on a slow machine.
             params: Other parameters of bag_player.
         """
         if "bag_player" in self.running:
@@ -115,6 +116,6 @@ def collect_logs() -> list[tuple[str, str]]:
             lines = processes.read_log(name).splitlines()
             note = ""
             if len(lines) > MAX_LOG_LINES:
-                note = f"(the last {MAX_LOG_LINES} of {len(lines)} lines, all in {processes.logs})\n"
+                note = f"(the last {MAX_LOG_LINES} of {len(lines)} lines; the full log is in {processes.logs})\n"
             logs.append((f"{name}, which {state}", note + "\n".join(lines[-MAX_LOG_LINES:])))
     return logs

@@ -60,11 +60,11 @@ BAD_INPUTS = {
     ),
     "missing data": (["convert", "{tmp}/none", "--out", "{tmp}/o"], "{tmp}/none does not exist"),
     "no data": (["convert", "{tmp}", "--out", "{tmp}/o"], "{tmp} is not a recording in a supported format"),
-    "existing out": (["convert", "{kitti}", "--out", "{bag}"], "exists already"),
+    "existing out": (["convert", "{kitti}", "--out", "{bag}"], "already exists"),
     "out is a file": (["convert", "{kitti}", "--out", "{kitti}/training/calib/000000.txt", "--force"], "is not a bag"),
     "out under a file": (
         ["convert", "{kitti}", "--out", "{kitti}/training/calib/000000.txt/o"],
-        "cannot make the folder",
+        "cannot create the folder",
     ),
     "out of range": (
         ["evaluate", "candidates", "--data", "{bag}", "--set", "ground.cloth.resolution=99"],

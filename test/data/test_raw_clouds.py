@@ -189,7 +189,7 @@ def test_records_with_other_columns_are_rejected(tmp_path, more):
     rng = np.random.default_rng(0)
     cloud = np.column_stack([rng.normal(0, 10, (400, 3)), rng.random((400, 1 + len(more)))])
     (tmp_path / "one.bin").write_bytes(cloud.astype(np.float32).tobytes())
-    with pytest.raises(InputError, match=r"one\.bin does not have the columns .* save it as \.pcd"):
+    with pytest.raises(InputError, match=r"one\.bin does not have the columns .* save the cloud as \.pcd"):
         read_points(tmp_path / "one.bin")
 
 

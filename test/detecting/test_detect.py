@@ -299,7 +299,7 @@ def test_folder_of_another_run_needs_force(kitti, tmp_path, monkeypatch, capsys,
     assert len(made) == 4 and len(read_json(out)["frames"]) == 4
     capsys.readouterr()
     line = refused(monkeypatch, capsys, kitti, "--out", out, "--min-score", 0.1)
-    assert f"{out} was begun with min_scores" in line and "--force" in line
+    assert f"{out} has a run with other settings (min_scores" in line and "--force" in line
     assert detect(monkeypatch, kitti, "--out", out, "--min-score", 0.1, "--force") == 0
     assert len(made) == 8 and not (out / "detections.csv").exists()
     assert not [*out.glob("kitti/*")] and len(objects(read_json(out))["000000"]) == 2

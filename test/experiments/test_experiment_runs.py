@@ -176,14 +176,14 @@ def test_folder_with_other_files_is_not_touched(few, tmp_path):
     out = tmp_path / "mine"
     write(out / "letter.txt", "dear")
     write(out / "figures/photo.png", "me")
-    with pytest.raises(InputError, match=f"{out} exists already.*--force"):
+    with pytest.raises(InputError, match=f"{out} already exists.*--force"):
         run_experiment(SMALL, open_recording(few), out)
     assert sorted(p.name for p in out.rglob("*.*")) == ["letter.txt", "photo.png"]
     run_experiment(SMALL, open_recording(few), out, force=True)
     assert (out / "letter.txt").read_text() == "dear" and (out / "figures/photo.png").exists()
     with pytest.raises(InputError, match="is a file"):
         run_experiment(SMALL, open_recording(few), out / "letter.txt")
-    with pytest.raises(InputError, match="cannot make the folder"):
+    with pytest.raises(InputError, match="cannot create the folder"):
         run_experiment(SMALL, open_recording(few), out / "letter.txt/deeper")
 
 

@@ -75,7 +75,7 @@ INVALID = [  # format, text that is replaced, replacement, words of the error
     ("labelcloud", '"x": 1', '"x": NaN', "box 1 of 1: its numbers must be finite"),
     ("labelcloud", '"x": 1', '"x": 1e308', "within 100000 m"),
     ("labelcloud", '"name"', '"track_id": 10000000000000000000, "name"', "not an integer"),
-    ("labelcloud", '"length": 4', '"length": 0', "its sides above 0"),
+    ("labelcloud", '"length": 4', '"length": 0', "and its sides positive"),
     ("labelcloud", '"centroid"', '"centre"', "has no 'centroid'"),
     ("labelcloud", '"name": "Car",', '"name": "Car"', ":1 is not valid JSON: Expecting ',' delimiter"),
     ("labelcloud", '"objects"', '"boxes"', "has no 'objects'"),
@@ -84,15 +84,15 @@ INVALID = [  # format, text that is replaced, replacement, words of the error
     ("sustech", "[", "{", ":1 is not valid JSON"),
     ("openlabel", "[1, 2", "[NaN, 2", "frame 5, box 1 of 1"),
     ("openlabel", "[1, 2, 3, 0, 0", "[1, 2, 3", "a cuboid has 8 numbers"),
-    ("openlabel", '"5"', '"50"', "has the frame '50' (1 unknown frames), but the drive has 5 to 7"),
-    ("openlabel", '"5": {', '"5": {"frame_properties": 7, ', "cannot be read"),
+    ("openlabel", '"5"', '"50"', "has labels of frame '50' (1 unknown frames), but the drive has frames 5 to 7"),
+    ("openlabel", '"5": {', '"5": {"frame_properties": 7, ', "is malformed"),
     ("openlabel", '"openlabel"', '"vcd"', "has no 'openlabel'"),
     ("nuscenes-detection", "[1, 2, 3]", "[1, 2, NaN]", "sample 0000/000005, box 1 of 1"),
-    ("nuscenes-detection", "[1, 0, 0, 0]", "[0, 0, 0, 0]", "cannot be read"),
-    ("nuscenes-detection", "0000/000005", "other", "has none of the drive's samples"),
+    ("nuscenes-detection", "[1, 0, 0, 0]", "[0, 0, 0, 0]", "is malformed"),
+    ("nuscenes-detection", "0000/000005", "other", "has no samples of this drive"),
     ("kitti", "3.9", "nan", "000005.txt:1 is not a KITTI label"),
     ("kitti", "Car 0", "Car 1e308", "000005.txt:1 is not a KITTI label"),
-    ("kitti-tracking", "5 1 Car", "51 1 Car", "0000.txt:1 belongs to frame 51, but the drive has 5"),
+    ("kitti-tracking", "5 1 Car", "51 1 Car", "0000.txt:1 is a label of frame 51, but the drive has frames 5"),
 ]
 
 
@@ -120,7 +120,7 @@ def test_kitti_folder_is_recognised_by_its_folders(tmp_path):
     write_dataset("kitti-tracking", drive("one"), tmp_path / "set")
     for path in tmp_path / "set", tmp_path / "set/training":
         assert recognise_format(path) == "kitti-tracking"
-    with pytest.raises(InputError, match="no labels are recognised"):
+    with pytest.raises(InputError, match="cannot recognise the label format"):
         recognise_format(tmp_path / "set/training/calib")
 
 
@@ -142,7 +142,7 @@ def test_kitti_folder_is_recognised_by_its_folders(tmp_path):
 )
 def test_other_json_files_are_not_recognised(content, tmp_path):
     (tmp_path / "0.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match="no labels are recognised"):
+    with pytest.raises(InputError, match="cannot recognise the label format"):
         recognise_format(tmp_path)
 
 
@@ -161,7 +161,7 @@ def test_unknown_or_missing_label_files_are_reported(format, tmp_path):
     suffix = VALID[format][0][-5:].lstrip("0123456789")
     stranger = path / f"000099{suffix}"
     stranger.write_text(text(VALID[format][1]))
-    with pytest.raises(InputError, match="belongs to no frame of the drive"):
+    with pytest.raises(InputError, match="does not belong to a frame of the drive"):
         import_labels(path, format, drive("one"))
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="has no label files"):
@@ -223,7 +223,7 @@ def test_existing_labels_are_replaced_only_with_force(format, tmp_path):
     frames = drive("one")
     labels, other = (make_labels(frames, format, seed) for seed in (0, 1))
     export_labels(labels, format, tmp_path / "out", frames)
-    with pytest.raises(InputError, match="exists already"):
+    with pytest.raises(InputError, match="already exists"):
         export_labels(other, format, tmp_path / "out", frames)
     export_labels(other, format, tmp_path / "out", frames, force=True)
     found = import_labels(tmp_path / "out", format, frames)
@@ -288,7 +288,7 @@ def test_missing_calibration_or_pose_is_reported(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["{bag}", "--to", "kitti", "--out", "{bag}"], "exists already"),
+        (["{bag}", "--to", "kitti", "--out", "{bag}"], "already exists"),
         (["{bag}", "--to", "nuscenes-tracking", "--out", "{out}"], "has no pose"),
         (
             ["{bag}", "--to", "kitti", "--detections", "/none", "--out", "{out}"],
@@ -296,7 +296,7 @@ def test_missing_calibration_or_pose_is_reported(tmp_path):
         ),
         (
             ["{bag}", "--to", "openlabel", "--detections", "/points", "--out", "{out}"],
-            "/points is sensor_msgs/msg/PointCloud2, but labels are",
+            "/points has the type sensor_msgs/msg/PointCloud2, but labels need",
         ),
         (["{bag}", "--points", "/lidar", "--to", "nuscenes", "--out", "{out}"], "has no topic /lidar"),
         (
@@ -307,7 +307,10 @@ def test_missing_calibration_or_pose_is_reported(tmp_path):
             ["{bag}", "--data", "{kitti}", "--detections", "/none", "--to", "openlabel", "--out", "{out}"],
             "has no topic /none",
         ),
-        (["{empty}", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"], "no labels are recognised in"),
+        (
+            ["{empty}", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"],
+            "cannot recognise the label format of",
+        ),
         (["{kitti}/none", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"], "does not exist"),
     ],
 )

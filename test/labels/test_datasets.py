@@ -160,7 +160,7 @@ def test_missing_camera_is_assumed_and_numbers_follow_time(tmp_path):
     assert {remark.split(":")[0]: n for remark, n in summary.remarks.items()} == {
         "assumed": 7,
         "left out": 7,
-        "without a track id": 6,
+        "boxes without a track id": 6,
     }
     back = open_recording(tmp_path / "k")
     assert [frame.name for frame in back] == [

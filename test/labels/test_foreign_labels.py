@@ -423,10 +423,10 @@ def test_cvat_tracklets_are_read(tmp_path):
     labels = import_labels(path, "kitti-raw", frames)
     assert [each.class_names for each in labels.frames] == [["bus"], ["Car"], ["Car"]]
     write_tracklets(path, TRACK.format("Car", 9, POSE))
-    with pytest.raises(InputError, match=r"has the frame 9 .* the drive has 5 to 7"):
+    with pytest.raises(InputError, match=r"has labels of frame 9 .* the drive has frames 5 to 7"):
         import_labels(path, "kitti-raw", frames)
     several = drive("several")
-    with pytest.raises(InputError, match="is one file, but the frames belong to 2 drives"):
+    with pytest.raises(InputError, match="is a single file, but the frames belong to 2 drives"):
         import_labels(path, "kitti-raw", several)
     with pytest.raises(InputError, match="has no tracklet_labels"):
         import_labels(path.parent, "kitti-raw", several)

@@ -175,11 +175,11 @@ def test_failed_or_empty_video_leaves_no_file(tmp_path):
 
 
 def test_unsupported_videos_are_rejected(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match=r"a.avi is not a video: .*\.mp4"):
+    with pytest.raises(InputError, match=r"a.avi is not a video file; .*\.mp4"):
         check_video(tmp_path / "a.avi", 1)
-    with pytest.raises(InputError, match=f"would have {MAX_ANIMATED + 1} pictures.*--limit"):
+    with pytest.raises(InputError, match=f"would have {MAX_ANIMATED + 1} frames.*--limit"):
         check_video(tmp_path / "a.gif", MAX_ANIMATED + 1)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"a.mp4 needs PyAV: pip install 'lidar_perception\[video"):
+    with pytest.raises(InputError, match=r"a.mp4 needs PyAV; run pip install 'lidar_perception\[video"):
         check_video(tmp_path / "a.mp4", 1)
     check_video(tmp_path / "a.webp", 1)

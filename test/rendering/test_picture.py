@@ -103,7 +103,7 @@ def test_view_covers_the_range_of_the_first_cloud(far, reach):
     scan = PointCloud(np.stack([far * np.cos(angles), far * np.sin(angles), 0 * angles], axis=1).astype(np.float32))
     stage = Stage.of(scan, 1.0, True, size=SIZE)
     assert stage.reach == pytest.approx(reach, rel=1e-3) and stage.ground == -1.0
-    assert 3 <= len(stage.rings) <= 12
+    assert 3 <= len(stage.ring_radii) <= 12
     assert Stage.of(EMPTY, 1.0, False).reach == 6.0
 
 
@@ -113,5 +113,5 @@ def test_color_scale_does_not_cover_the_classes(width):
     found = Boxes(np.repeat(BOX, 3, axis=0), np.array([CAR, PEDESTRIAN, CLASSES.index("Cyclist")]))
     *classes, scale, _ = _draw_legend(Canvas(width, 270, BACKGROUND), stage, found, BOX, True)
     last = classes[-1]
-    end, start = last.at[0] + 9 * len(last.text), scale.at[0] - 8 * len(scale.text)
-    assert len(classes) == 4 and (end < start or scale.at[1] < last.at[1] - 12)
+    end, start = last.position[0] + 9 * len(last.text), scale.position[0] - 8 * len(scale.text)
+    assert len(classes) == 4 and (end < start or scale.position[1] < last.position[1] - 12)

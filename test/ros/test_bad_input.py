@@ -93,7 +93,7 @@ def test_every_method_survives_invalid_clouds(values, send, process, results, sh
         "a million": cloud(rng.uniform(-50, 50, (1_000_000, 3)) * [1, 1, 0.05]),
     }
     before = len(results[node])
-    with peer.parameters(f"/{node}", values):
+    with peer.override_parameters(f"/{node}", values):
         for stamp, msg in enumerate(strange.values(), start=10):
             send(node, msg, lambda: True, "a subscriber")
             process(node, cloud(some, stamp))
@@ -108,9 +108,9 @@ def test_wrong_height_and_intensity_scale_are_reported(send, peer, good_cloud):
         send(node, good_cloud, lambda: words in peer.get_message(node), words)
 
     node = "ground_segmentation"
-    with peer.parameters(f"/{node}", {"ground.method": "patchwork", "ground.sensor_pose.height": 1.2}):
+    with peer.override_parameters(f"/{node}", {"ground.method": "patchwork", "ground.sensor_pose.height": 1.2}):
         is_reported("ground.sensor_pose.height is 1.2; set it to 1.7")
-        with peer.parameters(f"/{node}", {"ground.sensor_pose.height": 1.73, "input.intensity_max": 0.001}):
+        with peer.override_parameters(f"/{node}", {"ground.sensor_pose.height": 1.73, "input.intensity_max": 0.001}):
             is_reported("input.intensity_max")
     is_reported("segmenting")
     assert peer.get_message(node) == "segmenting"
@@ -149,8 +149,8 @@ def test_diagnostics_report_missing_camera_and_seed(send, peer, good_cloud, driv
     def is_reported(words):
         send("perception", good_cloud, lambda: words in peer.get_message("perception"), words)
 
-    with peer.parameters("/perception", {"seed.source": "click"}):
-        with peer.parameters("/perception", {"view.enabled": True, "input.max_wait": 0.5}):
+    with peer.override_parameters("/perception", {"seed.source": "click"}):
+        with peer.override_parameters("/perception", {"view.enabled": True, "input.max_wait": 0.5}):
             is_reported("camera calibration")
         found = peer.listen("/perception/output/detections", MARKERS)
         is_reported("no seed yet")

@@ -148,14 +148,14 @@ def test_thresholds_change_at_run_time_others_are_fixed(tested, talker, found, p
     assert described.floating_point_range[0].to_value == 1.0 and "Car" in described.description
 
     names = [k for k in tested.values(Path("w")) if k.startswith(f"{network}.scores.")]
-    with peer.parameters(f"/{tested.node}", dict.fromkeys(names, 1.0)):
+    with peer.override_parameters(f"/{tested.node}", dict.fromkeys(names, 1.0)):
         peer.send(talker, message(12), lambda: received(found, 12) is not None, "no detections")
         assert len(received(found, 12)) == 0
         peer.wait(lambda: "threshold" in peer.get_message(tested.node), "the reason")
         if tested is not FUSED_NODE:
             peer.wait(lambda: "Car 0." in (peer.get_value(tested.node, "best scores") or ""), "the scores")
     if tested is POINTPILLARS_NODE:
-        with peer.parameters(f"/{tested.node}", {"ground.sensor_pose.height": 1.2}):
+        with peer.override_parameters(f"/{tested.node}", {"ground.sensor_pose.height": 1.2}):
             peer.send(
                 talker,
                 message(13),

@@ -81,7 +81,7 @@ def test_parameters_are_those_of_the_dataclass(perception, shared_peer):
         if fields[d.name].metadata["unit"]:
             assert f"[{fields[d.name].metadata['unit']}]" in d.description
 
-    with peer.parameters("/perception", {"stm.threshold": 0.6}):
+    with peer.override_parameters("/perception", {"stm.threshold": 0.6}):
         for name, value, words in [
             ("stm.threshold", 1.5, ""),
             ("clustering.dbscan.eps", [0.1], "range_limits"),
@@ -182,7 +182,7 @@ def test_bad_parameter_files_are_rejected_in_one_line(processes):
 def test_missing_template_is_reported_with_first_cloud(perception, shared_peer, talker, good_cloud):
     """It is only a diagnostic, because the file may appear later."""
     peer = shared_peer
-    with peer.parameters("/perception", {"seed.file": "/nowhere.json"}):
+    with peer.override_parameters("/perception", {"seed.file": "/nowhere.json"}):
         peer.send(talker, good_cloud, lambda: "/nowhere.json" in peer.get_message("perception"), "the diagnostic")
 
 

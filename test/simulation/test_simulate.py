@@ -168,9 +168,9 @@ def test_existing_files_are_kept_without_force(made, tmp_path):
     out = tmp_path / "set"
     assert run(out, "kitti", 2).exit_code == 0
     before = content(out)
-    with pytest.raises(InputError, match="exists already"):
+    with pytest.raises(InputError, match="already exists"):
         run(out, "kitti", 3)
-    with pytest.raises(InputError, match="was begun with frames 2, not 3"):
+    with pytest.raises(InputError, match="other settings \\(frames 2, not 3"):
         run(out, "kitti", 3, 1, "--resume")
     assert content(out) == before
     (tmp_path / "mine").mkdir()
@@ -229,7 +229,7 @@ def test_other_sensor_of_same_name_is_not_resumed(tmp_path):
     invoke(options)
     assert "is already complete" in invoke([*options, "--resume"]).output
     sensor.write_text("elevations: [2, -9]\nazimuth_step: 5\nrate: 10\n")
-    with pytest.raises(InputError, match="was begun with sensor_digest"):
+    with pytest.raises(InputError, match="other settings \\(sensor_digest"):
         invoke([*options, "--resume"])
 
 

@@ -66,7 +66,7 @@ def test_example_test_passes_and_failure_shows_the_detections(folder):
         "while the test waited for a miracle, speaker ended with code 3",
         "log of speaker, which ended with code 3",
         "I am tired",
-        "in vain for 2 messages on /nowhere; diagnostics: none; received: /nowhere nothing from 0 publishers",
+        "waiting for 2 messages on /nowhere; diagnostics: none; received: /nowhere no messages from 0 publishers",
     ):
         assert words in said, done.stdout
 

@@ -276,7 +276,7 @@ def test_train_fused_writes_usable_file(tmp_path, monkeypatch, capsys):
     assert fusion.models_without_intensity == find_fusion().models_without_intensity != fusion.models
     assert fusion.fitted_to["sensor"] == "vlp-16" and fusion.fitted_to["range"] == "around"
     before = out.read_bytes()
-    assert exit_of(monkeypatch, *command) == 2 and "exists already" in error_line(capsys)
+    assert exit_of(monkeypatch, *command) == 2 and "already exists" in error_line(capsys)
     assert exit_of(monkeypatch, "train", "fused", "--out", tmp_path / "fused") == 2
     assert "must end with .json" in error_line(capsys)
     assert out.read_bytes() == before

@@ -1,7 +1,8 @@
 """Labels in a rosbag2 bag, as MarkerArray and Detection3DArray, with or without clouds.
 
-A message belongs to the frame with its header.stamp. Numbers are stored without rounding.
-Detection3DArray has one class, score and id per box; other fields are in the text of the markers.
+A message belongs to the frame with the same header.stamp. Numbers are stored without rounding.
+Detection3DArray has a class, score and id for each box; other fields are in the text of the
+markers.
 """
 
 from __future__ import annotations
@@ -27,18 +28,19 @@ MARKERS, DETECTIONS = "visualization_msgs/msg/MarkerArray", "vision_msgs/msg/Det
 
 
 def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels:
-    """Read the boxes from a MarkerArray or Detection3DArray topic of any node.
+    """Read the boxes on a topic with MarkerArray or Detection3DArray messages of any node.
 
     Track ids are read from `track_id` in the text of label markers and from `id` in the text of
-    track markers. The ids of a Detection3DArray are track ids unless they only number the boxes of
-    each message.
+    track markers. The ids of a Detection3DArray are used as track ids unless they only number the
+    boxes in each message.
     """
     stamps = {frame.stamp_ns for frame in frames}
     with Bag(path) as bag:
         bag.require(topic)
         if bag.topics[topic] not in (MARKERS, DETECTIONS):
             raise InputError(
-                f"{path}: {topic} is {bag.topics[topic]}, but labels are {MARKERS} or {DETECTIONS}; give another topic"
+                f"{path}: {topic} has the type {bag.topics[topic]}, but labels need {MARKERS} or {DETECTIONS}; "
+                "choose another topic"
             )
         are_markers = bag.topics[topic] == MARKERS
         objects_by_stamp: dict[int, MarkedObjects] = {}
@@ -49,9 +51,8 @@ def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels
             objects_by_stamp[stamp_ns] = poses.to_cloud_frame(objects, topic)
     if unknown_stamps := sorted(objects_by_stamp.keys() - stamps):
         raise InputError(
-            f"{path}: {topic} has labels at {unknown_stamps[0]} ns ({len(unknown_stamps)} of "
-            f"{len(objects_by_stamp)} such stamps), where the drive has no frame; give the drive "
-            "that was labelled"
+            f"{path}: {topic} has labels at {unknown_stamps[0]} ns, but the drive has no frame with this stamp "
+            f"({len(unknown_stamps)} of {len(objects_by_stamp)} stamps are unknown); give the drive that was labelled"
         )
     has_ids = are_markers or any(sorted(o.ids.tolist()) != list(range(len(o))) for o in objects_by_stamp.values())
     return DriveLabels(
@@ -69,7 +70,7 @@ def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels
 
 
 def _make_frame_labels(
-    frame: Frame, objects: MarkedObjects | None, are_markers: bool, has_ids: bool, where: str
+    frame: Frame, objects: MarkedObjects | None, are_markers: bool, has_ids: bool, source: str
 ) -> FrameLabels:
     if objects is None:
         return FrameLabels.of(frame.name, frame.stamp_ns)
@@ -82,7 +83,7 @@ def _make_frame_labels(
             ids[k] = int(objects.ids[k])
     scores = [e.pop("score", np.nan) for e in extra] if are_markers else objects.scores
     names = [e.pop("class_name", label) for e, label in zip(extra, objects.labels)]
-    return FrameLabels.of(frame.name, frame.stamp_ns, objects.boxes, names, ids, scores, extra, objects.notes, where)
+    return FrameLabels.of(frame.name, frame.stamp_ns, objects.boxes, names, ids, scores, extra, objects.notes, source)
 
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False, clouds: bool = True) -> None:

@@ -1,4 +1,4 @@
-"""Label files: their assignment to frames and drives, track names, and JSON."""
+"""Helpers for label files: their assignment to frames and drives, track names, and JSON."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from lidar_perception.runs.files import check_unused, read_text, write_folder, w
 from lidar_perception.types import InputError
 
 MAX_BYTES = 2**30  # maximum size of a label file
-CONFLICTING = "kept"  # field with the fields whose names the format uses itself
+CONFLICTS_KEY = "kept"  # key of extra fields whose names have another meaning in the format
 
 
 def group_by_sequence(frames: Sequence[Frame]) -> dict[str, list[int]]:
-    """Return the positions of the frames of each sequence, in order."""
+    """Return the positions in `frames` of the frames of each sequence, in order."""
     positions: dict[str, list[int]] = {}
     for i, frame in enumerate(frames):
         positions.setdefault(frame.sequence, []).append(i)
@@ -29,8 +29,8 @@ def group_by_sequence(frames: Sequence[Frame]) -> dict[str, list[int]]:
 def list_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[str, Path]:
     """Return the label file of each drive.
 
-    It is `path` if it has the suffix, otherwise path/DRIVE.suffix. A drive without a name is called
-    0000.
+    The file is `path` if this has the suffix, otherwise path/DRIVE.suffix. A drive without a name
+    is called 0000.
 
     Raises:
         InputError: `path` is a single file, but there are several drives.
@@ -39,7 +39,7 @@ def list_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[s
     if path.suffix == suffix:
         if len(names) != 1:
             raise InputError(
-                f"{path} is one file, but the frames belong to {len(names)} drives, "
+                f"{path} is a single file, but the frames belong to {len(names)} drives, "
                 f"such as {names[0]!r}; give a folder, or choose a drive with --split"
             )
         return {names[0]: path}
@@ -49,7 +49,7 @@ def list_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[s
 def find_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[str, Path]:
     """Return the existing files of list_drive_files, and `path` if it is a file.
 
-    Raises InputError as check_label_files does.
+    Raises the errors of check_label_files.
     """
     files = list_drive_files(path, frames, suffix)
     if path not in files.values():
@@ -60,11 +60,11 @@ def find_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[s
 def write_drives(
     out: Path, frames: Sequence[Frame], suffix: str, force: bool, write: Callable[[Path, str, list[int]], None]
 ) -> None:
-    """Call write(file, drive, positions) for each drive, with the positions of its frames.
+    """Write one file per drive with write(file, drive, positions of its frames).
 
     Args:
-        out: File of the only drive if it has the suffix, otherwise a folder. The folder appears
-            when it is complete.
+        out: File of the only drive if it has the suffix, otherwise a folder, which appears when it
+            is complete.
         frames: Frames of all drives.
         suffix: Suffix of a label file.
         force: Replace existing files.
@@ -84,14 +84,14 @@ def write_drives(
 def list_frame_files(folder: Path, frames: Sequence[Frame], suffix: str) -> list[Path]:
     """Return the label file FRAME.suffix of each frame.
 
-    If there are several drives, each has its own folder.
+    With several drives, each drive has its own folder.
     """
     has_drives = len(group_by_sequence(frames)) > 1
     return [folder / f"{frame.name if has_drives else frame.name.rpartition('/')[2]}{suffix}" for frame in frames]
 
 
 def check_label_files(folder: Path, expected: Sequence[Path], suffix: str, ignored: Sequence[str] = ()) -> None:
-    """Check that a folder has label files, and only those of the given frames.
+    """Check that a folder has label files, and no label files of other frames.
 
     Args:
         folder: The folder.
@@ -100,7 +100,8 @@ def check_label_files(folder: Path, expected: Sequence[Path], suffix: str, ignor
         ignored: Names of other files that are allowed.
 
     Raises:
-        InputError: The folder does not exist, has no label file, or has one of another frame.
+        InputError: The folder does not exist, has no label files, or has label files of other
+            frames.
     """
     if not folder.is_dir():
         raise InputError(f"the folder {folder} does not exist; give the folder of the label files")
@@ -113,31 +114,31 @@ def check_label_files(folder: Path, expected: Sequence[Path], suffix: str, ignor
     example = min(names, default="none")
     if unknown_names := sorted(existing - names):
         raise InputError(
-            f"{folder / unknown_names[0]} belongs to no frame of the drive "
-            f"({len(unknown_names)} such files; those of the drive are named like "
-            f"{example}); give the drive that was labelled, or move these files away"
+            f"{folder / unknown_names[0]} does not belong to a frame of the drive "
+            f"({len(unknown_names)} such files; expected names such as {example}); "
+            "give the drive that was labelled, or move these files away"
         )
     if not existing:
-        raise InputError(f"{folder} has no label files (*{suffix}); those of this drive would be named like {example}")
+        raise InputError(f"{folder} has no label files (*{suffix}); expected names such as {example}")
 
 
 def merge_extra(extra: dict[str, Any], own_names: Collection[str]) -> dict[str, Any]:
     """Return the extra fields of a box as fields of a format.
 
-    Fields whose names the format uses itself are stored under CONFLICTING.
+    Fields with a name in `own_names`, which the format uses itself, are stored under CONFLICTS_KEY.
     """
-    conflicting = {key: value for key, value in extra.items() if key in own_names or key == CONFLICTING}
+    conflicts = {key: value for key, value in extra.items() if key in own_names or key == CONFLICTS_KEY}
     return {
-        **{key: value for key, value in extra.items() if key not in conflicting},
-        **({CONFLICTING: conflicting} if conflicting else {}),
+        **{key: value for key, value in extra.items() if key not in conflicts},
+        **({CONFLICTS_KEY: conflicts} if conflicts else {}),
     }
 
 
 def extract_extra(item: dict[str, Any], own_names: Collection[str]) -> dict[str, Any]:
     """Return the extra fields of a box, the inverse of merge_extra."""
-    conflicting = item.get(CONFLICTING)
+    conflicts = item.get(CONFLICTS_KEY)
     extra = {key: value for key, value in item.items() if key not in own_names}
-    return {**extra, **extra.pop(CONFLICTING)} if isinstance(conflicting, dict) else extra
+    return {**extra, **extra.pop(CONFLICTS_KEY)} if isinstance(conflicts, dict) else extra
 
 
 def assign_track_ids(names: Iterable[str]) -> dict[str, int]:
@@ -149,9 +150,9 @@ def assign_track_ids(names: Iterable[str]) -> dict[str, int]:
 
 
 def collect_track_names(frames: Iterable[FrameLabels], key: str) -> dict[int, str]:
-    """Return the original name of each track, stored in extra[key] when the file was read.
+    """Return the original name of each track, which was stored in extra[key] when the file was read.
 
-    Each name is used for one track only, so that the parts of a split track have different names.
+    A name is used for only one track, so that the parts of a split track have different names.
     """
     names: dict[int, str] = {}
     used_names = set()
@@ -165,7 +166,7 @@ def collect_track_names(frames: Iterable[FrameLabels], key: str) -> dict[int, st
 
 
 def is_track_number(name: str) -> bool:
-    """Return True if the name of a track is an integer in its usual spelling."""
+    """Return True if the name of a track is a decimal integer without leading zeros."""
     return name.isascii() and name.isdigit() and len(name) < 19 and name == str(int(name))
 
 
@@ -173,17 +174,17 @@ def read_json(path: Path) -> Any:
     """Read a JSON file.
 
     Raises:
-        InputError: The file cannot be read or is not valid JSON; the message has the line.
+        InputError: The file cannot be read or is not valid JSON.
     """
     text = read_text(path, MAX_BYTES)
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
         raise InputError(
-            f"{path}:{error.lineno} is not valid JSON: {error.msg} at column {error.colno}; write the file again"
+            f"{path}:{error.lineno} is not valid JSON: {error.msg} at column {error.colno}; export the file again"
         ) from None
     except RecursionError:
-        raise InputError(f"{path} is nested too deeply; write the file again") from None
+        raise InputError(f"{path} is nested too deeply; export the file again") from None
 
 
 def write_json(path: Path, content: Any, indent: int | None = None) -> None:
@@ -192,7 +193,7 @@ def write_json(path: Path, content: Any, indent: int | None = None) -> None:
 
 
 def replace_non_finite(value: Any) -> Any:
-    """Return a JSON value in which numbers that are not finite are replaced by null."""
+    """Replace numbers in a JSON value that are not finite by null."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
@@ -202,16 +203,16 @@ def replace_non_finite(value: Any) -> Any:
     return value
 
 
-def report_format_errors(where: str, read: Callable[[], Any]) -> Any:
-    """Call read(), and convert its errors to InputErrors that name `where`.
+def report_format_errors(source: str, read: Callable[[], Any]) -> Any:
+    """Call read(), and convert its errors to InputErrors that start with `source`.
 
-    For parsers of files whose values may be of any type.
+    Use it for parsers of files whose values may be of any type.
     """
     try:
         return read()
     except InputError:
         raise
     except KeyError as error:
-        raise InputError(f"{where} has no {error}; write the file again") from None
+        raise InputError(f"{source} has no {error}; export the file again") from None
     except (TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
-        raise InputError(f"{where} cannot be read ({error}); write the file again") from None
+        raise InputError(f"{source} is malformed ({error}); export the file again") from None

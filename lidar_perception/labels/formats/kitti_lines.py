@@ -1,9 +1,9 @@
 """Conversion between labels and lines of KITTI's label files.
 
-The development kits' readme files define the columns: location is the centre of the bottom face in
-the rectified camera's frame (x right, y down, z forward), and rotation_y is the rotation about its
-y axis, 0 where the length points to the right. A box that was read and not changed is written with
-all its original columns.
+The readme files of the development kits define the columns: location is the centre of the bottom
+face in the rectified camera's frame (x right, y down, z forward), and rotation_y is the rotation
+about its y axis, 0 for a box whose length points to the right. A box that has not changed since it
+was read is written with all its original columns.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from lidar_perception.labels.drive_labels import (
 )
 from lidar_perception.types import InputError
 
-# Minimum hidden fractions of the 2D box of a partly (1) and a largely (2) occluded object.
-MIN_PARTLY, MIN_LARGELY = 0.1, 0.5
-LEVELS = (-1, 0, 1, 2)  # levels of truncation in the tracking layout
+MIN_PARTLY = 0.1  # minimum hidden fraction of the 2D box of a partly occluded object (level 1)
+MIN_LARGELY = 0.5  # minimum hidden fraction of the 2D box of a largely occluded object (level 2)
+TRUNCATION_LEVELS = (-1, 0, 1, 2)  # levels of truncation in the tracking layout
 
 
 def require_calibration(frame: Frame) -> Calibration:
@@ -44,24 +44,24 @@ def require_calibration(frame: Frame) -> Calibration:
     if calibration is None:
         raise InputError(
             f"frame {frame.name} has no camera calibration, but KITTI's labels are in "
-            "the camera frame; use labelcloud, sustech or openlabel, which are in the "
-            "LiDAR frame"
+            "the camera frame; use labelcloud, sustech or openlabel, whose labels are in "
+            "the LiDAR frame"
         )
     return calibration
 
 
 def find_label_folder(path: Path, name: str) -> Path:
-    """Find the folder `name` (label_2 or label_02) in a folder of KITTI's layout.
+    """Find the folder `name` (label_2 or label_02) in a folder with KITTI's layout.
 
-    Returns `path` itself if there is no such folder.
+    Returns `path` itself if the folder is not found.
     """
     for subfolder in (f"training/{name}", name):
         path = path / subfolder if (path / subfolder).is_dir() else path
     return path
 
 
-def parse_frame_labels(frame: Frame, lines: Sequence[dict[str, Any]], where: object) -> FrameLabels:
-    """Convert parsed lines (see data.kitti.labels.parse_label) to the labels of a frame."""
+def parse_frame_labels(frame: Frame, lines: Sequence[dict[str, Any]], source: object) -> FrameLabels:
+    """Convert the parsed lines of a frame (see data.kitti.labels.parse_label) to its labels."""
     if not lines:
         return make_frame_labels(frame, ())
     to_lidar = np.linalg.inv(require_calibration(frame).lidar_to_camera)
@@ -74,14 +74,14 @@ def parse_frame_labels(frame: Frame, lines: Sequence[dict[str, Any]], where: obj
             notes.append((line["class"], extra))
         else:
             rows.append((box, line["class"], extra.pop("track_id", NO_TRACK), extra.pop("score", np.nan), extra))
-    return make_frame_labels(frame, rows, notes, where)
+    return make_frame_labels(frame, rows, notes, source)
 
 
 def make_lines(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str, Any]]:
-    """Convert labels to the columns for data.kitti.labels.format_label: boxes first, then notes.
+    """Convert labels to columns for data.kitti.labels.format_label: boxes first, then notes.
 
-    For new and changed boxes, alpha, the 2D box (zero outside the image), the truncation and, if
-    missing, the level of occlusion by other boxes are computed.
+    For new and changed boxes, alpha, the 2D box (zero outside the image), the truncation and, if it
+    is missing, the level of occlusion by other boxes are computed.
 
     Args:
         labels: Labels of the frame.
@@ -121,7 +121,7 @@ def make_lines(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str
 
 
 def _make_note_line(name: str, extra: dict[str, Any]) -> dict[str, Any]:
-    """Return the columns of an object without a 3D box: as read, or those of DontCare."""
+    """Return the original columns of an object without a 3D box, or if incomplete those of DontCare."""
     shapes = {"bbox": (4,), "dimensions": (3,), "location": (3,)}
     with suppress(KeyError, TypeError, ValueError):
         if all(np.array(extra[c], np.float64).shape == shapes.get(c, ()) for c in COLUMNS):
@@ -144,14 +144,14 @@ def _is_unchanged_line(box: np.ndarray, extra: dict[str, Any], to_lidar: np.ndar
 
 
 def _is_level(truncated: float, track: int) -> bool:
-    """Return True if a truncation is a level, as in the tracking layout, not a fraction."""
-    return isinstance(truncated, int) or (track != NO_TRACK and truncated in LEVELS)
+    """Return True if a truncation is a level, as in the tracking layout, and not a fraction."""
+    return isinstance(truncated, int) or (track != NO_TRACK and truncated in TRUNCATION_LEVELS)
 
 
 def compute_occlusion_levels(pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Compute the level of occlusion of 2D boxes by nearer boxes.
+    """Compute the level of occlusion of each 2D box by closer boxes.
 
-    Unlabelled objects are not considered.
+    Unlabelled objects are not taken into account.
 
     Args:
         pixels: (K, 4) boxes [left top right bottom].
@@ -162,14 +162,14 @@ def compute_occlusion_levels(pixels: np.ndarray, depths: np.ndarray) -> np.ndarr
     """
     levels = np.zeros(len(pixels), int)
     for k, (left, top, right, bottom) in enumerate(pixels):
-        nearer = pixels[(depths < depths[k]) & np.isfinite(pixels[:, 0])]
-        if not np.isfinite(left) or len(nearer) == 0:
+        closer_boxes = pixels[(depths < depths[k]) & np.isfinite(pixels[:, 0])]
+        if not np.isfinite(left) or len(closer_boxes) == 0:
             continue
-        # Sample a grid of 32 x 32 points in the box, so that overlapping boxes count once.
+        # Test a grid of 32 x 32 points in the box, so that areas hidden by several boxes count once.
         u = left + (np.arange(32) + 0.5) / 32 * (right - left)
         v = top + (np.arange(32) + 0.5) / 32 * (bottom - top)
-        inside_columns = (u >= nearer[:, :1]) & (u < nearer[:, 2:3])
-        inside_rows = (v >= nearer[:, 1:2]) & (v < nearer[:, 3:])
-        hidden_share = (inside_columns[:, None, :] & inside_rows[:, :, None]).any(axis=0).mean()
-        levels[k] = int(hidden_share >= MIN_PARTLY) + int(hidden_share >= MIN_LARGELY)
+        inside_columns = (u >= closer_boxes[:, :1]) & (u < closer_boxes[:, 2:3])
+        inside_rows = (v >= closer_boxes[:, 1:2]) & (v < closer_boxes[:, 3:])
+        hidden_fraction = (inside_columns[:, None, :] & inside_rows[:, :, None]).any(axis=0).mean()
+        levels[k] = int(hidden_fraction >= MIN_PARTLY) + int(hidden_fraction >= MIN_LARGELY)
     return levels

@@ -13,12 +13,12 @@ from lidar_perception.labels.formats.files import check_label_files, list_frame_
 from lidar_perception.labels.formats.kitti_lines import find_label_folder, make_lines, parse_frame_labels
 from lidar_perception.runs.files import write_bytes, write_folder
 
-# KITTI's files have two decimals; computed numbers have up to six.
-ZEROS = re.compile(r"(\.\d\d\d*?)0+(?=\s|$)")
+# Trailing zeros after the second decimal. KITTI's files have two decimals; computed numbers have up to six.
+TRAILING_ZEROS = re.compile(r"(\.\d\d\d*?)0+(?=\s|$)")
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read a folder with FRAME.txt, or a folder of the object layout.
+    """Read a folder with files FRAME.txt, or a folder with the object layout.
 
     Frames without a file have no labels.
     """
@@ -43,4 +43,6 @@ def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool =
 
 def format_frame(labels: FrameLabels, frame: Frame) -> str:
     """Format the labels of a frame as the lines of its file."""
-    return "".join(ZEROS.sub(r"\1", format_label(line, 6)) + "\n" for line in make_lines(labels, frame, levels=False))
+    return "".join(
+        TRAILING_ZEROS.sub(r"\1", format_label(line, 6)) + "\n" for line in make_lines(labels, frame, levels=False)
+    )

@@ -26,7 +26,7 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
     drives = group_by_sequence(frames)
     if path.is_file() and len(drives) > 1:
         raise InputError(
-            f"{path} is one file, but the frames belong to {len(drives)} drives; give "
+            f"{path} is a single file, but the frames belong to {len(drives)} drives; give "
             "a folder, or choose a drive with --split"
         )
     labels: list[FrameLabels] = []
@@ -51,11 +51,11 @@ def _read_drive(path: Path, frames: Sequence[Frame]) -> list[FrameLabels]:
     numbers_by_name = read_frame_list(frame_list) if frame_list.exists() else {}
     numbers = [numbers_by_name.get(frame.name.rpartition("/")[2], frame.index) for frame in frames]
     truth = read_tracklets(path)
-    # Tracks continue over missing scans, so numbers within the drive are allowed.
+    # Tracks continue over missing scans, so any number between the first and last frame is allowed.
     if unknown_numbers := sorted(n for n in truth if not min(numbers) <= n <= max(numbers)):
         raise InputError(
-            f"{path} has the frame {unknown_numbers[0]} ({len(unknown_numbers)} unknown frames), but "
-            f"the drive has {min(numbers)} to {max(numbers)}; give the drive that was "
+            f"{path} has labels of frame {unknown_numbers[0]} ({len(unknown_numbers)} unknown frames), but "
+            f"the drive has frames {min(numbers)} to {max(numbers)}; give the drive that was "
             "labelled"
         )
     return [

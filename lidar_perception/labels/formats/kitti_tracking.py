@@ -1,4 +1,4 @@
-"""KITTI's tracking benchmark, label_02: one text file per drive, with frame number and track id."""
+"""KITTI's tracking benchmark, label_02: one text file per drive, with frame numbers and track ids."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lidar_perception.types import InputError
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read DRIVE.txt, a folder of such files, or a folder of the tracking layout."""
+    """Read DRIVE.txt, a folder of such files, or a folder with the tracking layout."""
     path = find_label_folder(path, "label_02")
     files = find_drive_files(path, frames, ".txt")
     labels: list[FrameLabels] = []
@@ -27,9 +27,9 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
             for number, frame, line in parse_tracking_lines(files[drive]):
                 if frame not in lines:
                     raise InputError(
-                        f"{files[drive]}:{number} belongs to frame {frame}, but the "
-                        f"drive has {min(lines)} to {max(lines)} ({len(lines)} "
-                        "frames); give the drive that was labelled"
+                        f"{files[drive]}:{number} is a label of frame {frame}, but the "
+                        f"drive has frames {min(lines)} to {max(lines)}; give the drive "
+                        "that was labelled"
                     )
                 lines[frame].append({**line, "truncated": round(line["truncated"])})
         labels += [
@@ -51,7 +51,7 @@ def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool =
 
 
 def format_frame(labels: FrameLabels, frame: Frame, number: int) -> str:
-    """Format the labels of a frame as lines that start with its number."""
+    """Format the labels of a frame as lines that start with the frame number."""
     return "".join(
         format_tracking_line(number, line.get("track_id", NO_TRACK), line)
         for line in make_lines(labels, frame, levels=True)

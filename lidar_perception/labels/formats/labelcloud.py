@@ -1,4 +1,4 @@
-"""labelCloud's JSON files, one per frame: a centroid and rotations, or eight vertices.
+"""labelCloud's JSON files, one per frame: each box has a centroid and rotations, or eight vertices.
 
 Rotations are about z, then the rotated y, then the rotated x, in degrees from 0 to 360
 (centroid_abs) or in radians from -pi to pi (centroid_rel). The length is along the rotated x axis.
@@ -50,7 +50,7 @@ OWN_FIELDS = {"name", "centroid", "dimensions", "rotations", "vertices", "track_
 
 
 def _read(notation: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read a folder with FRAME.json. A frame without a file has no labels."""
+    """Read a folder with files FRAME.json. Frames without a file have no labels."""
     files = list_frame_files(path, frames, SUFFIX)
     check_label_files(path, files, SUFFIX, ignored=(CLASSES_FILE,))
     classes = path / CLASSES_FILE
@@ -62,7 +62,7 @@ def _read(notation: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
     for frame, file in zip(frames, files):
         content = read_json(file) if file.exists() else {"objects": []}
         rows = report_format_errors(str(file), partial(_parse_objects, content, notation))
-        labels.append(make_frame_labels(frame, rows, where=file))
+        labels.append(make_frame_labels(frame, rows, source=file))
         if file.exists():
             headers[frame.name] = {k: v for k, v in content.items() if k != "objects"}
     return DriveLabels(labels, {ROOT: headers})
@@ -73,8 +73,8 @@ def _parse_objects(content: dict[str, Any], notation: str) -> list[Row]:
     for item in content["objects"]:
         extra = extract_extra(item, OWN_FIELDS)
         shape = {key: item[key] for key in ("rotations", "vertices") if key in item}
-        box, tilted = _parse_box(item, notation)
-        if tilted:
+        box, is_tilted = _parse_box(item, notation)
+        if is_tilted:
             extra[TILTED] = {**shape, "unit": notation, "box": box}
         rows.append(
             (box, str(item["name"]), int(item.get("track_id", NO_TRACK)), float(item.get("score", math.nan)), extra)

@@ -1,8 +1,8 @@
-"""Result files of nuScenes' detection and tracking tasks: JSON files with boxes by sample.
+"""Result files of nuScenes' detection and tracking tasks: JSON files with the boxes of each sample.
 
 Boxes are in the global frame, so the recording needs poses. size is [width length height] and
-rotation is [w x y z], with x forward. The token of a frame that is not from nuScenes is its name.
-nuscenes-devkit ignores additional fields and rejects unknown classes; both are written.
+rotation is [w x y z], with x forward. The name of a frame is its sample token, unless it comes from
+nuScenes. nuscenes-devkit ignores additional fields and rejects unknown classes; both are written.
 """
 
 from __future__ import annotations
@@ -48,13 +48,15 @@ from lidar_perception.types import InputError
 
 ROOT = "nuscenes"
 NO_SCORE = -1.0  # score of labels, as in nuscenes-devkit
-OUR_NAMES = {**CLASS_BY_NAME, **{name: our_name for our_name, name in NAME_BY_CLASS.items()}}
-NUSCENES_NAMES = {our_name: name for name, our_name in OUR_NAMES.items()}
-# Our classes that nuScenes lacks, such as vans -> nuScenes class; our name is written as a field.
-SIMILAR_NAMES = {row.name: NUSCENES_NAMES[row.looks_like] for row in TABLE if row.looks_like in NUSCENES_NAMES}
-WRITTEN_NAMES = {**NUSCENES_NAMES, **SIMILAR_NAMES}
-# nuScenes classes that correspond to ours only with a rider.
-RIDDEN_CLASSES, NOT_RIDDEN = OUR_NAMES.keys() - CLASS_BY_NAME.keys(), "cycle.without_rider"
+CLASS_BY_NUSCENES_NAME = {**CLASS_BY_NAME, **{name: our_name for our_name, name in NAME_BY_CLASS.items()}}
+NUSCENES_NAME_BY_CLASS = {our_name: name for name, our_name in CLASS_BY_NUSCENES_NAME.items()}
+# Class that nuScenes lacks, such as Van -> similar nuScenes class; the original name is written as a field.
+SIMILAR_NAME_BY_CLASS = {
+    row.name: NUSCENES_NAME_BY_CLASS[row.looks_like] for row in TABLE if row.looks_like in NUSCENES_NAME_BY_CLASS
+}
+WRITTEN_NAME_BY_CLASS = {**NUSCENES_NAME_BY_CLASS, **SIMILAR_NAME_BY_CLASS}
+# nuScenes classes that correspond to a class of this package only with a rider.
+RIDDEN_CLASSES, WITHOUT_RIDER = CLASS_BY_NUSCENES_NAME.keys() - CLASS_BY_NAME.keys(), "cycle.without_rider"
 OWN_FIELDS = {"sample_token", "translation", "size", "rotation", "velocity", "tracking_id", "attribute_name"}
 
 
@@ -66,20 +68,19 @@ def _require_pose(frame: Frame) -> np.ndarray:
     pose = frame.pose()
     if pose is None:
         raise InputError(
-            f"frame {frame.name} has no pose, but nuScenes' boxes are in a fixed "
+            f"frame {frame.name} has no pose, but nuScenes' boxes are in a global "
             "frame; use openlabel, labelcloud or sustech, which need no poses"
         )
     return pose
 
 
 def _read(task: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read a result file; boxes of other drives in it are ignored."""
+    """Read a result file; the boxes of other drives in it are ignored."""
     content = read_json(path)
     results = report_format_errors(str(path), lambda: dict(content["results"]))
     if not results.keys() & {_get_token(frame) for frame in frames}:
         raise InputError(
-            f"{path} has none of the drive's samples, the first of which is "
-            f"{_get_token(frames[0])}; give the results of this drive"
+            f"{path} has no samples of this drive, such as {_get_token(frames[0])}; give the results of this drive"
         )
     ids = report_format_errors(
         str(path),
@@ -87,10 +88,10 @@ def _read(task: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
     )
     labels = []
     for frame in frames:
-        where = f"{path}, sample {_get_token(frame)}"
+        source = f"{path}, sample {_get_token(frame)}"
         boxes = results.get(_get_token(frame), [])
-        rows = report_format_errors(where, partial(_parse_boxes, task, frame, boxes, ids))
-        labels.append(make_frame_labels(frame, rows, where=where))
+        rows = report_format_errors(source, partial(_parse_boxes, task, frame, boxes, ids))
+        labels.append(make_frame_labels(frame, rows, source=source))
     return DriveLabels(labels, {ROOT: {key: v for key, v in content.items() if key != "results"}})
 
 
@@ -104,16 +105,16 @@ def _parse_boxes(task: str, frame: Frame, boxes: list[dict[str, Any]], ids: dict
             extra["attribute"] = attribute
         if (velocity := _parse_velocity(row.get("velocity"))) is not None:
             extra["velocity"] = velocity
-        box, tilted = _to_local_box(row, pose)
-        if tilted:
+        box, is_tilted = _to_local_box(row, pose)
+        if is_tilted:
             extra["rotation"] = row["rotation"]
         track = str(row.get("tracking_id", ""))
         if track and track != str(ids[track]):
             extra["tracking_id"] = track
         score = float(row.get(f"{task}_score", NO_SCORE))
-        if SIMILAR_NAMES.get(extra.get("class_name", "")) == class_name:
+        if SIMILAR_NAME_BY_CLASS.get(extra.get("class_name", "")) == class_name:
             class_name = extra.pop("class_name")
-        class_name = class_name if attribute == NOT_RIDDEN else OUR_NAMES.get(class_name, class_name)
+        class_name = class_name if attribute == WITHOUT_RIDER else CLASS_BY_NUSCENES_NAME.get(class_name, class_name)
         rows.append((box, class_name, ids.get(track, NO_TRACK), np.nan if score < 0 else score, extra))
     return rows
 
@@ -126,7 +127,8 @@ def _parse_velocity(velocity: Any) -> list[float] | None:
 def _to_local_box(row: dict[str, Any], pose: np.ndarray) -> tuple[list[float], bool]:
     """Transform a global box to the frame with this pose.
 
-    Returns the box, and True if it is tilted in that frame.
+    Returns:
+        The box, and True if it is tilted in that frame.
     """
     width, length, height = row["size"]
     box = GlobalBoxes.of([row["translation"]], [[length, width, height]], [row["rotation"]], 0)
@@ -135,7 +137,7 @@ def _to_local_box(row: dict[str, Any], pose: np.ndarray) -> tuple[list[float], b
     return to_local_boxes(box, pose)[0].tolist(), bool(are_tilted(box, pose)[0])
 
 
-def find_read_rotation(labels: FrameLabels, k: int, pose: np.ndarray) -> list[float] | None:
+def find_original_rotation(labels: FrameLabels, k: int, pose: np.ndarray) -> list[float] | None:
     """Return the original rotation [w x y z] of a tilted box; None if the box has changed."""
     rotation, box = labels.extra[k].get("rotation"), labels.boxes[k]
     if not isinstance(rotation, list) or len(rotation) != 4:
@@ -148,9 +150,9 @@ def find_read_rotation(labels: FrameLabels, k: int, pose: np.ndarray) -> list[fl
 
 
 def _write(task: str, labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
-    """Write one JSON file.
+    """Write a JSON file.
 
-    Missing velocities are computed from the tracks. Without a track they are NaN, which
+    Missing velocities are computed from the tracks. For boxes without a track they are NaN, which
     nuscenes-devkit can read.
     """
     check_unused(out, force)
@@ -177,23 +179,23 @@ def _make_columns(
     extra = dict(labels.extra[k])
     attribute = extra.pop("attribute", None) or ""
     if class_name in RIDDEN_CLASSES:
-        attribute = NOT_RIDDEN
-    elif NUSCENES_NAMES.get(class_name) in RIDDEN_CLASSES and attribute == NOT_RIDDEN:
-        attribute = ""  # no longer valid, because a person changed the class
+        attribute = WITHOUT_RIDER
+    elif NUSCENES_NAME_BY_CLASS.get(class_name) in RIDDEN_CLASSES and attribute == WITHOUT_RIDER:
+        attribute = ""  # the attribute is no longer valid, because the class was changed by hand
     extra.pop("tracking_id", None)
-    if class_name in SIMILAR_NAMES:
+    if class_name in SIMILAR_NAME_BY_CLASS:
         extra["class_name"] = class_name
     if isinstance(read_velocity := extra.pop("velocity", None), list) and len(read_velocity) == 2:
         velocity = _parse_velocity(read_velocity) or velocity
     columns = {
         "velocity": velocity,
         "attribute_name": attribute,
-        f"{task}_name": WRITTEN_NAMES.get(class_name, class_name),
+        f"{task}_name": WRITTEN_NAME_BY_CLASS.get(class_name, class_name),
         f"{task}_score": (float(labels.scores[k]) if np.isfinite(labels.scores[k]) else NO_SCORE),
     }
     if task == "tracking" or track != NO_TRACK:
         columns["tracking_id"] = "" if track == NO_TRACK else names.get(track, str(track))
-    if rotation := find_read_rotation(labels, k, pose):
+    if rotation := find_original_rotation(labels, k, pose):
         columns["rotation"] = rotation
     extra.pop("rotation", None)
     return {**merge_extra(extra, OWN_FIELDS | columns.keys()), **columns}
@@ -202,7 +204,7 @@ def _make_columns(
 def _compute_velocities(
     labels: DriveLabels, frames: Sequence[Frame], poses: dict[int, np.ndarray]
 ) -> dict[tuple[int, int], list[float]]:
-    """Compute velocities in the fixed frame, m/s, from the previous and next box of each track.
+    """Compute velocities in the global frame from the previous and next box of each track.
 
     Args:
         labels: Labels of the frames.
@@ -210,7 +212,7 @@ def _compute_velocities(
         poses: Pose of each frame with boxes.
 
     Returns:
-        Velocity [x y] by (frame, box).
+        Velocity [x y] in m/s by (position of the frame, index of the box).
     """
     tracks: dict[tuple[str, int], list[tuple[int, int]]] = {}
     for i, (frame_labels, frame) in enumerate(zip(labels.frames, frames)):

@@ -1,9 +1,10 @@
-"""ASAM OpenLABEL 1.0: one JSON file per drive, with cuboids that have a quaternion.
+"""ASAM OpenLABEL 1.0: one JSON file per drive, with cuboids whose orientation is a quaternion.
 
 A cuboid is [x y z qx qy qz qw sx sy sz]: centre, orientation in its coordinate system, and sizes
-along its axes. We write x along the length to the front, y to the left and z up, as in ISO 8855, in
-the LiDAR's coordinate system. Frame numbers are those of the drive. All other content of a file is
-preserved: fields of a cuboid in FrameLabels.extra, those of the drive in DriveLabels.extra.
+along its axes. Cuboids are written with x along the length to the front, y to the left and z up, as
+in ISO 8855, in the LiDAR's coordinate system. Frames are numbered as in the drive. Other content of
+a file is preserved: fields of a cuboid in FrameLabels.extra, fields of the drive in
+DriveLabels.extra.
 """
 
 from __future__ import annotations
@@ -43,18 +44,18 @@ from lidar_perception.labels.formats.files import (
 from lidar_perception.types import InputError
 
 SUFFIX, ROOT = ".json", "openlabel"
-# Attributes of a cuboid, and keys in FrameLabels.extra: attributes that are not plain values, data
-# of the object, and the original cuboid, which is written unless the box was moved.
-SCORE, TRACKED, TYPE = "confidence", "tracked", "type"
-UID, OTHER, OBJECT = "uid", "openlabel_attributes", "openlabel_data"
-REGION = "openlabel_region"  # data of an object whose 2D boxes became notes with KITTI's columns
+SCORE, TRACKED, TYPE = "confidence", "tracked", "type"  # attributes of a cuboid
+UID = "uid"  # key in `extra` and in notes: id of the object in the file
+OTHER = "openlabel_attributes"  # key in `extra`: attributes that are not plain values
+OBJECT = "openlabel_data"  # key in `extra` and in notes: data of the object
+ORIGINAL = "openlabel_cuboid"  # key in `extra`: original cuboid, which is written unless the box was changed
+REGION = "openlabel_region"  # key in a note: data of the object whose 2D boxes were read as notes
 REGION_CLASS = "DontCare"
-PROPERTIES = "frame_properties"
-ORIGINAL, DATA, CUBOIDS = "openlabel_cuboid", "object_data", "cuboid"
+PROPERTIES, DATA, CUBOIDS = "frame_properties", "object_data", "cuboid"  # keys of the format
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read one JSON file, or a folder with DRIVE.json of each drive."""
+    """Read one JSON file, or a folder with one DRIVE.json per drive."""
     files = find_drive_files(path, frames, SUFFIX)
     labels: list[FrameLabels] = []
     extra = {}
@@ -63,23 +64,27 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
         if drive not in files:
             labels += [make_frame_labels(frame, ()) for frame in drive_frames]
             continue
-        where = str(files[drive])
+        source = str(files[drive])
         drive_labels, extra[drive] = report_format_errors(
-            where, partial(_read_drive, files[drive], drive_frames, where)
+            source, partial(_read_drive, files[drive], drive_frames, source)
         )
         labels += drive_labels
     return DriveLabels(labels, {ROOT: extra})
 
 
-def _read_drive(path: Path, frames: list[Frame], where: str) -> tuple[list[FrameLabels], dict[str, Any]]:
-    """Read the file of a drive; return the labels of each frame, and its other content."""
+def _read_drive(path: Path, frames: list[Frame], source: str) -> tuple[list[FrameLabels], dict[str, Any]]:
+    """Read the file of a drive.
+
+    Returns:
+        The labels of each frame, and the other content of the file.
+    """
     content = dict(read_json(path)[ROOT])
     objects, systems = content.get("objects", {}), content.get("coordinate_systems", {})
     frame_contents = content.get("frames", {})
     if unknown_numbers := sorted(set(frame_contents) - {str(frame.index) for frame in frames}):
         raise InputError(
-            f"{where} has the frame {unknown_numbers[0]!r} ({len(unknown_numbers)} unknown frames), "
-            f"but the drive has {frames[0].index} to {frames[-1].index}; give the "
+            f"{source} has labels of frame {unknown_numbers[0]!r} ({len(unknown_numbers)} unknown frames), "
+            f"but the drive has frames {frames[0].index} to {frames[-1].index}; give the "
             "drive that was labelled"
         )
     numbers = assign_track_ids(
@@ -105,7 +110,7 @@ def _read_drive(path: Path, frames: list[Frame], where: str) -> tuple[list[Frame
             for k, cuboid in enumerate(cuboids):
                 system = cuboid.get("coordinate_system", "")
                 box, is_upright = parts.cuboid_to_box(
-                    cuboid["val"], parts.find_transform_to_lidar(system, systems, frame_content, frame, where)
+                    cuboid["val"], parts.find_transform_to_lidar(system, systems, frame_content, frame, source)
                 )
                 rows.append(
                     (
@@ -115,12 +120,12 @@ def _read_drive(path: Path, frames: list[Frame], where: str) -> tuple[list[Frame
                             **uid_field,
                             **({OBJECT: data} if data and k == 0 else {}),
                             **_parse_extra(
-                                cuboid, box, is_upright and system in ("", parts.find_lidar_system(systems, where))
+                                cuboid, box, is_upright and system in ("", parts.find_lidar_system(systems, source))
                             ),
                         },
                     )
                 )
-        labels.append(make_frame_labels(frame, rows, notes, f"{where}, frame {frame.index}"))
+        labels.append(make_frame_labels(frame, rows, notes, f"{source}, frame {frame.index}"))
     return labels, {
         **content,
         "frames": {
@@ -133,20 +138,20 @@ def _read_drive(path: Path, frames: list[Frame], where: str) -> tuple[list[Frame
     }
 
 
-def _make_region_notes(kind: str, uid: str, data: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
-    """Return the notes of an object without a cuboid.
+def _make_region_notes(object_class: str, uid: str, data: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """Make the notes of an object without a cuboid.
 
     Each 2D box becomes a note with KITTI's columns; the first note also has the object's data. An
-    object without 2D boxes becomes one note with its data.
+    object without 2D boxes becomes a single note with its data.
     """
     values, other_items = parts.parse_named_values(data)
     columns = {name: DONT_CARE[name] for name in COLUMNS if name in DONT_CARE}
     notes = [
-        (kind, {**columns, **values, "bbox": box, UID: uid, REGION: {} if k else data})
+        (object_class, {**columns, **values, "bbox": box, UID: uid, REGION: {} if k else data})
         for k, box in enumerate(parts.find_regions(data))
     ]
     return notes or [
-        (kind, {**values, **({OBJECT: other_items} if other_items else {}), **({} if values else {UID: uid})})
+        (object_class, {**values, **({OBJECT: other_items} if other_items else {}), **({} if values else {UID: uid})})
     ]
 
 
@@ -163,8 +168,11 @@ def _parse_track(cuboid: dict[str, Any], object_class: str, number: int) -> tupl
 def _parse_extra(cuboid: dict[str, Any], box: list[float], is_plain: bool) -> dict[str, Any]:
     """Return the extra fields of a cuboid.
 
-    `is_plain` is True if the box describes the cuboid completely; otherwise the original cuboid is
-    kept.
+    Args:
+        cuboid: Cuboid in the file.
+        box: Box made from the cuboid.
+        is_plain: True if the box describes the cuboid completely; otherwise the original cuboid is
+            one of the fields.
     """
     values, other_items = parts.parse_named_values(cuboid.get("attributes", {}))
     extra = {name: v for name, v in values.items() if name not in (SCORE, TRACKED, TYPE)}
@@ -193,13 +201,13 @@ def _make_content(
         labels: Labels of all frames.
         frames: All frames.
         positions: Positions of the drive's frames in `frames`.
-        original: Content of the file that was read, without cuboids; {} for none.
+        original: Content of the file that was read, without cuboids; {} if no file was read.
     """
-    drive = [(frames[i], labels.frames[i]) for i in positions]
-    named_tracks = collect_track_names((frame_labels for _, frame_labels in drive), UID)
-    note_uids = {str(note[UID]) for _, frame_labels in drive for _, note in frame_labels.notes if UID in note}
+    drive_frames = [(frames[i], labels.frames[i]) for i in positions]
+    named_tracks = collect_track_names((frame_labels for _, frame_labels in drive_frames), UID)
+    note_uids = {str(note[UID]) for _, frame_labels in drive_frames for _, note in frame_labels.notes if UID in note}
     used_uids = (
-        {str(i) for _, frame_labels in drive for i in frame_labels.track_ids.tolist()}
+        {str(i) for _, frame_labels in drive_frames for i in frame_labels.track_ids.tolist()}
         | {*named_tracks.values()}
         | note_uids
     )
@@ -209,7 +217,9 @@ def _make_content(
         if uid in used_uids or not o.get("frame_intervals")
     }  # objects that are still used, or not bound to frames
     systems = (
-        original if original.get("coordinate_systems") else parts.make_coordinate_systems([frame for frame, _ in drive])
+        original
+        if original.get("coordinate_systems")
+        else parts.make_coordinate_systems([frame for frame, _ in drive_frames])
     )
     lidar = parts.find_lidar_system(systems["coordinate_systems"], "the file that was read")
     numbers = [int(uid) for uid in (*used_uids, *objects) if is_track_number(uid)]
@@ -218,10 +228,10 @@ def _make_content(
     frames_by_object: dict[str, list[int]] = {}
 
     def get_object_data(uid: str, object_class: str, index: int) -> dict[str, Any]:
-        """Return the data of an object in a frame; add the object if it is new."""
+        """Return the data of an object in a frame, and add the object if it is new."""
         if uid not in frames_by_object:
             known_object = objects.get(uid, {})
-            same_class = find_class_name(str(known_object.get("type", ""))) == object_class  # compared in any spelling
+            same_class = find_class_name(str(known_object.get("type", ""))) == object_class
             objects[uid] = {
                 "name": f"{object_class} {uid}",
                 **known_object,
@@ -232,7 +242,7 @@ def _make_content(
         data: dict[str, Any] = frame_objects.setdefault(uid, {DATA: {}})[DATA]
         return data
 
-    for frame, frame_labels in drive:
+    for frame, frame_labels in drive_frames:
         original_content = original.get("frames", {}).get(str(frame.index), {})
         frame_contents[str(frame.index)] = {
             **original_content,
@@ -263,7 +273,7 @@ def _make_content(
             **systems,
             "frames": frame_contents,
             "objects": objects,
-            "frame_intervals": parts.find_intervals([frame.index for frame, _ in drive]),
+            "frame_intervals": parts.find_intervals([frame.index for frame, _ in drive_frames]),
         }
     }
 

@@ -1,7 +1,7 @@
 """Parts of OpenLABEL files: coordinate systems, cuboids in them, and named values.
 
-A coordinate system has a pose in its parent (pose_wrt_parent), or a frame has a transform between
-the two. A value is {"name": ..., "val": ...} in the list of its type: num, text, boolean, vec.
+The pose of a coordinate system in its parent is in pose_wrt_parent, or is a transform of each
+frame. A value is {"name": ..., "val": ...} in the list of its type: num, text, boolean or vec.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.data.nuscenes.boxes import to_matrices
 from lidar_perception.types import InputError
 
-LIDAR, CAMERA, FIXED = "lidar", "camera", "odom"
-MAX_TILT = 1e-9  # 1 - cosine of the angle between the z axis of a box and the vertical
+LIDAR, CAMERA, FIXED = "lidar", "camera", "odom"  # names of written coordinate systems
+MAX_TILT = 1e-9  # maximum of 1 - cos(angle between the z axis and the vertical) of an upright cuboid
 
 
 def cuboid_to_box(val: Sequence[float], to_lidar: np.ndarray) -> tuple[list[float], bool]:
     """Convert a cuboid to a box.
 
-    The height is the size along the axis that is closest to the vertical, which is y in a camera's
-    system (x right, y down, z forward). The length is the size along the first of the other two
-    axes, as in KITTI and ISO 8855.
+    The height is the size along the axis that is closest to the vertical; for cuboids in a camera's
+    system (x right, y down, z forward) this is y. The length is the size along the first of the
+    other two axes, as in KITTI and ISO 8855.
 
     Args:
         val: 10 numbers [x y z qx qy qz qw sx sy sz], or 9 numbers with three angles instead of the
@@ -38,7 +38,7 @@ def cuboid_to_box(val: Sequence[float], to_lidar: np.ndarray) -> tuple[list[floa
         The box [x y z l w h yaw] in the LiDAR's system, and True if the cuboid's z axis points up.
     """
     if len(val) not in (9, 10):
-        raise ValueError(f"a cuboid has {len(val)} numbers instead of 10 or 9")
+        raise ValueError(f"a cuboid has {len(val)} numbers, expected 10 or 9")
     axes = to_lidar[:3, :3] @ (quaternion_to_matrix(val[3:7]) if len(val) == 10 else _euler_to_matrix(*val[3:6]))
     x, y, z = (to_lidar[:3, :3] @ np.array(val[:3], float) + to_lidar[:3, 3]).tolist()
     up_axis = 2 - int(np.abs(axes[2, ::-1]).argmax())
@@ -86,24 +86,24 @@ def _euler_to_matrix(x: float, y: float, z: float) -> np.ndarray:
 
 
 def find_transform_to_lidar(
-    name: str, systems: dict[str, Any], frame: dict[str, Any], recorded_frame: Frame, where: str
+    name: str, systems: dict[str, Any], frame: dict[str, Any], recorded_frame: Frame, source: str
 ) -> np.ndarray:
     """Return the transform (4, 4) from a coordinate system to that of the LiDAR.
 
-    It is computed from the poses in the file, and from the pose of the recording if one is missing.
-    For a camera in a file without a LiDAR, it is the calibration of the recording.
+    It is computed from the poses in the file; a missing pose is taken from the recording. For a
+    camera in a file without a LiDAR, the calibration of the recording is used.
 
     Args:
         name: Name of the coordinate system, "" for the LiDAR's.
         systems: Coordinate systems of the file.
         frame: Content of the frame in the file.
         recorded_frame: The same frame of the recording.
-        where: Name of the file, for error messages.
+        source: Name of the file, for error messages.
 
     Raises:
         InputError: The systems are not connected.
     """
-    lidar = find_lidar_system(systems, where)
+    lidar = find_lidar_system(systems, source)
     if name in ("", lidar):
         return np.eye(4)
     calibration = recorded_frame.calibration() if _is_camera(name) and lidar not in systems else None
@@ -115,32 +115,32 @@ def find_transform_to_lidar(
         for _ in systems:
             if system not in systems:
                 raise InputError(
-                    f"{where} does not define the coordinate system {system!r} of a cuboid; write the file again"
+                    f"{source} does not define the coordinate system {system!r} of a cuboid; export the file again"
                 )
             if not (parent := systems[system].get("parent")):
                 break
-            pose = _find_pose(system, parent, systems, frame, recorded_frame, where)
+            pose = _find_pose(system, parent, systems, frame, recorded_frame, source)
             transform, system = pose @ transform, parent
         roots.append((system, transform))
     if roots[0][0] != roots[1][0]:
         raise InputError(
-            f"{where}: the coordinate systems {name!r} and {lidar!r} are not connected; write the file again"
+            f"{source}: the coordinate systems {name!r} and {lidar!r} are not connected; export the file again"
         )
     return np.linalg.inv(roots[1][1]) @ roots[0][1]
 
 
-def find_lidar_system(systems: dict[str, Any], where: str) -> str:
+def find_lidar_system(systems: dict[str, Any], source: str) -> str:
     """Return the name of the LiDAR's coordinate system.
 
     Raises:
-        InputError: Several systems may be that of the LiDAR.
+        InputError: Several coordinate systems may belong to the LiDAR.
     """
     sensors = [name for name, s in systems.items() if s.get("type") == "sensor_cs" and not _is_camera(name)]
     lidars = [name for name in sensors if any(word in name.lower() for word in ("lidar", "velo", "laser"))] or sensors
     if len(lidars) > 1:
         raise InputError(
-            f"{where} has several sensors that may be the LiDAR: {', '.join(lidars)}; "
-            f"rename the right one to {LIDAR!r}, and the others to other names"
+            f"{source} has several sensors that may be the LiDAR: {', '.join(lidars)}; "
+            f"rename the LiDAR to {LIDAR!r}, and give the others names without it"
         )
     return lidars[0] if lidars else LIDAR
 
@@ -150,7 +150,7 @@ def _is_camera(name: str) -> bool:
 
 
 def _find_pose(
-    name: str, parent: str, systems: dict[str, Any], frame: dict[str, Any], recorded_frame: Frame, where: str
+    name: str, parent: str, systems: dict[str, Any], frame: dict[str, Any], recorded_frame: Frame, source: str
 ) -> np.ndarray:
     for transform in frame.get("frame_properties", {}).get("transforms", {}).values():
         if transform["src"] == name and transform["dst"] == parent:
@@ -160,8 +160,8 @@ def _find_pose(
     pose = recorded_frame.pose()
     if pose is None:
         raise InputError(
-            f"{where}: the pose of {name!r} in {parent!r} is missing in frame {recorded_frame.index}; "
-            "write the file again"
+            f"{source}: the pose of {name!r} in {parent!r} is missing in frame {recorded_frame.index}; "
+            "export the file again"
         )
     return pose
 
@@ -178,8 +178,8 @@ def _parse_transform(data: dict[str, Any]) -> np.ndarray:
 def make_coordinate_systems(frames: Sequence[Frame]) -> dict[str, Any]:
     """Make coordinate_systems and streams of a drive.
 
-    They contain the LiDAR and, if the recording has poses or a calibration, a fixed system and the
-    camera.
+    They contain the LiDAR, a fixed system if the recording has poses, and the camera if it has a
+    calibration.
     """
     calibration = frames[0].calibration() if frames else None
     has_poses = bool(frames) and frames[0].pose() is not None
@@ -229,7 +229,7 @@ def make_transforms(frame: Frame) -> dict[str, Any]:
 
 
 def to_named_values(values: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """Convert a JSON object to named values by type; other values become a text NAME.json."""
+    """Convert a JSON object to named values by type; values of other types become a text NAME.json."""
     values_by_type: dict[str, list[dict[str, Any]]] = {}
     for name, value in values.items():
         value_type = next((value_type for value_type, is_type in TYPES.items() if is_type(value)), "")
@@ -240,7 +240,11 @@ def to_named_values(values: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
 
 
 def parse_named_values(lists: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[Any]]]:
-    """Invert to_named_values; return the plain values, and all other items by type."""
+    """Parse named values, the inverse of to_named_values.
+
+    Returns:
+        The plain values by name, and all other items by type.
+    """
     values: dict[str, Any] = {}
     other_items: dict[str, list[Any]] = {}
     for value_type, items in lists.items():
@@ -255,7 +259,7 @@ def parse_named_values(lists: dict[str, Any]) -> tuple[dict[str, Any], dict[str,
 
 
 def _is_number(value: Any) -> bool:
-    """Return True for a number in the range of float64; other tools cannot read larger ones."""
+    """Return True for a number in the range of float64; other tools cannot read larger numbers."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
@@ -268,11 +272,11 @@ TYPES = {
 
 
 def find_intervals(numbers: list[int]) -> list[dict[str, int]]:
-    """Group numbers into intervals of consecutive frames."""
-    runs: list[dict[str, int]] = []
+    """Group frame numbers into intervals of consecutive frames."""
+    intervals: list[dict[str, int]] = []
     for number in sorted(set(numbers)):
-        if runs and runs[-1]["frame_end"] == number - 1:
-            runs[-1]["frame_end"] = number
+        if intervals and intervals[-1]["frame_end"] == number - 1:
+            intervals[-1]["frame_end"] = number
         else:
-            runs.append({"frame_start": number, "frame_end": number})
-    return runs
+            intervals.append({"frame_start": number, "frame_end": number})
+    return intervals

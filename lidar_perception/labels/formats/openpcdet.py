@@ -14,7 +14,7 @@ from lidar_perception.labels.formats.files import check_label_files, list_frame_
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read a folder with FRAME.txt or labels/FRAME.txt.
+    """Read a folder with files FRAME.txt or labels/FRAME.txt.
 
     Frames without a file have no labels.
     """

@@ -1,8 +1,8 @@
 """SUSTechPOINTS' JSON files, one per frame: position, scale and rotation of each box.
 
-scale.x is the length of the box; at rotation 0 it points forward. Rotations are in radians, about
-x, then the rotated y, then the rotated z, in the LiDAR frame. Ids are text. Numbers are stored
-without rounding. SUSTechPOINTS drops unknown fields when it saves.
+scale.x is the length of the box, which points forward at rotation 0. Rotations are in radians,
+about x, then the rotated y, then the rotated z, in the LiDAR frame. Ids are text. Numbers are
+stored without rounding. SUSTechPOINTS drops unknown fields when it saves.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ OWN_FIELDS = {"psr", "obj_type", "obj_id", "score"}
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read a folder with FRAME.json or label/FRAME.json.
+    """Read a folder with files FRAME.json or label/FRAME.json.
 
     Frames without a file have no labels.
     """
@@ -61,7 +61,7 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
     labels = []
     for frame, file, content in zip(frames, files, contents):
         rows = report_format_errors(str(file), partial(_parse_boxes, content, ids))
-        labels.append(make_frame_labels(frame, rows, where=file))
+        labels.append(make_frame_labels(frame, rows, source=file))
     return DriveLabels(labels)
 
 
@@ -104,11 +104,11 @@ def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool =
 def _make_object(labels: FrameLabels, k: int, names: dict[int, str]) -> dict[str, Any]:
     box, extra = labels.boxes[k], dict(labels.extra[k])
     fields = get_id_and_score(labels, k)
-    tilted, _ = extra.pop(TILTED, None), extra.pop("obj_id", None)
+    original, _ = extra.pop(TILTED, None), extra.pop("obj_id", None)
     track = fields.pop("track_id", "")
     rotation = {"x": 0, "y": 0, "z": float(box[6])}
-    if tilted and is_unchanged(box, tilted["box"]):
-        rotation = tilted["rotation"]
+    if original and is_unchanged(box, original["box"]):
+        rotation = original["rotation"]
     psr = {
         "position": dict(zip("xyz", box[:3].tolist())),
         "scale": dict(zip("xyz", box[3:6].tolist())),
