@@ -234,7 +234,7 @@ def test_force_keeps_other_files(tmp_path):
     frames = drive("one")
     export_labels(make_labels(frames, "sustech"), "sustech", tmp_path / "out", frames)
     (tmp_path / "out/notes.txt").write_text("mine")
-    with pytest.raises(InputError, match=r"would not be replaced \(1, such as notes.txt\)"):
+    with pytest.raises(InputError, match=r"1 files that would not be replaced, such as notes.txt"):
         export_labels(make_labels(frames, "sustech", 1), "sustech", tmp_path / "out", frames, True)
     assert (tmp_path / "out/notes.txt").read_text() == "mine"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out"]

@@ -77,7 +77,7 @@ def test_point_colour_is_height_or_intensity(stage):
     scan = PointCloud(np.array([[15.0, 0, 1.0]], np.float32), np.array([0.9], np.float32))
     for color, expected in (("height", color_by_height(np.array([2.73]))[0]), ("intensity", None)):
         made = Stage(stage.reach, stage.ahead, stage.ground, color, *SIZE)
-        expected = made.colors(scan)[0] if expected is None else expected
+        expected = made.color_points(scan)[0] if expected is None else expected
         assert all(
             np.subtract(
                 count_pixels(draw_frame(made, scan, Boxes()), expected, 0),
