@@ -165,7 +165,7 @@ def test_missing_pedestrian_is_reported_and_old_scores_are_kept(tmp_path, monkey
         (["run", "fused"], "did you mean 'fused_detector'?"),
         (["convert", "a", "--out", "b", "--limit", "0"], "0 is not in the range"),
         (["convert", "a"], "--out"),
-        (["simulate", "--frames", "1", "--out", "."], "no name for a new file"),
+        (["simulate", "--frames", "1", "--out", "."], "is not the name of a new file"),
         (["run", "bogus"], "'bogus'"),
     ],
 )

@@ -284,7 +284,7 @@ def spoil(**values):
     [
         (lambda r: r.pop("s0k1"), "no boxes for scene-0103/01, sample s0k1 (missing: 1 of 8 frames)"),
         (lambda r: r.update(s0k0=r["s0k0"] * 100), "at most 500 boxes"),
-        (lambda r: r.update(s0k0={}), "needs a list"),
+        (lambda r: r.update(s0k0={}), "is not a list"),
         (lambda r: r["s0k0"][0].pop("size"), "a box has no 'size'"),
         (spoil(detection_name="van"), "the class 'van' is not one of"),
         (spoil(attribute_name="red"), "is malformed"),
