@@ -85,7 +85,7 @@ class Camera:
         return inside & (depth > 0)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _in_view(xyz, projection, width, height):
     p = projection
     in_view = np.empty(len(xyz), np.bool_)

@@ -116,9 +116,8 @@ def normalize_intensity(intensity: np.ndarray | None, indices: np.ndarray | None
     mean_values = np.bincount(inverse, REFERENCE_VALUES) / np.bincount(inverse)
     if indices is not None:
         intensity = intensity.take(indices)
-    is_positive = intensity > 0
-    normalized = np.where(np.isnan(intensity), intensity, np.float32(0)).astype(np.float32)
-    normalized[is_positive] = np.interp(intensity[is_positive], distinct_knots, mean_values)
+    normalized = np.interp(intensity, distinct_knots, mean_values).astype(np.float32)
+    normalized[intensity <= 0] = 0
     return normalized
 
 

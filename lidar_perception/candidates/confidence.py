@@ -134,7 +134,7 @@ def _load_models() -> dict[str, Any]:
     return json.loads((files("lidar_perception.candidates") / "confidence.json").read_text())
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _compute_moments(xyz, start):
     """Compute seven features of each cluster, (K, 7).
 

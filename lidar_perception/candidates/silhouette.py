@@ -109,7 +109,7 @@ def count_pixels(images: np.ndarray) -> np.ndarray:
     return np.unpackbits(images.view(np.uint8), axis=1).sum(axis=1, dtype=np.int64)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _draw_silhouettes(xyz, start, scales, floors, is_metric, use_pca, half_angles, dilations):
     images = np.zeros((len(start) - 1, ROWS), np.uint32)
     rows = np.empty(ROWS, np.uint64)
@@ -143,7 +143,7 @@ def _draw_silhouettes(xyz, start, scales, floors, is_metric, use_pca, half_angle
     return images
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _draw_points(y, z, scales, is_metric, half_sizes, left, top, columns_per_m, rows_per_m, rows):
     for s in range(len(scales)):
         if s > 0 and scales[s] == 1.0:
@@ -163,7 +163,7 @@ def _draw_points(y, z, scales, is_metric, half_sizes, left, top, columns_per_m, 
                 rows[row] |= bits
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _find_centroid(points):
     mean = np.zeros(3)
     for p in points:
@@ -172,7 +172,7 @@ def _find_centroid(points):
     return mean / len(points)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _find_yaw_axes(points, centre):
     """Return two unit vectors: the widest direction in x-y, pointing to the sensor's left, and the up axis."""
     xx, xy, yy = 0.0, 0.0, 0.0
@@ -188,7 +188,7 @@ def _find_yaw_axes(points, centre):
     return lateral, np.array([0.0, 0.0, 1.0])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _find_principal_axes(points, centre):
     """Return the principal axes with the second largest and the largest variance, pointing left and up."""
     scatter = np.zeros((3, 3))
@@ -205,7 +205,7 @@ def _find_principal_axes(points, centre):
     return lateral, vertical
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _dilate(rows):
     """Dilate an image with a 3 x 3 kernel; pixels outside the window count as not set."""
     widened_rows = (rows | (rows << ONE) | (rows >> ONE)) & FULL_ROW
@@ -215,7 +215,7 @@ def _dilate(rows):
     return result
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _erode(rows):
     """Erode an image with a 3 x 3 kernel; pixels outside the window count as set, so that borders remain."""
     narrowed_rows = rows & ((rows << ONE) | ONE) & ((rows >> ONE) | (ONE << LAST_COLUMN))

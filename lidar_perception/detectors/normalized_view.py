@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 
 from lidar_perception.classes import CAR
 from lidar_perception.geometry import wrap_angle
@@ -56,14 +57,14 @@ class NormalizedView:
                 Patchwork++, which removes dark points below the ground as reflections.)
         """
         shift = np.array([0, 0, pose.height - SENSOR_HEIGHT], np.float32)
-        xyz, indices, frame = level_points(source.xyz, pose), np.arange(len(source)), source
+        xyz, indices = level_points(source.xyz, pose), None
         if low is not None and high is not None:
-            indices = _find_indices_in_range(xyz, np.array(low, np.float32) - shift, np.array(high, np.float32) - shift)
-            frame, xyz = source.take(indices), xyz.take(indices, axis=0)
-        intensity = (
-            normalize_intensity(source.intensity, None if frame is source else indices) if use_intensity else None
-        )
-        frame = replace(frame, xyz=xyz + shift, intensity=intensity)
+            indices, xyz = _select_in_range(
+                np.ascontiguousarray(xyz), np.array(low, np.float32) - shift, np.array(high, np.float32) - shift
+            )
+        intensity = normalize_intensity(source.intensity, indices) if use_intensity else None
+        frame = replace(source, xyz=xyz + shift, intensity=intensity)
+        indices = np.arange(len(source)) if indices is None else indices
         return NormalizedView(frame, indices, source, pose, use_intensity)
 
     def __len__(self) -> int:
@@ -118,18 +119,27 @@ class NormalizedView:
         )
 
 
-def _find_indices_in_range(xyz: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    with np.errstate(invalid="ignore"):
-        in_range = np.ones(len(xyz), bool)
-        for axis in range(3):
-            in_range &= (xyz[:, axis] >= low[axis]) & (xyz[:, axis] < high[axis])
-    return np.flatnonzero(in_range)
+@njit(cache=True, nogil=True)
+def _select_in_range(xyz, low, high):
+    """Return the indices (M,) int64 of the points (N, 3) with low <= x y z < high, and these points (M, 3)."""
+    indices, count = np.empty(len(xyz), np.int64), 0
+    for i in range(len(xyz)):  # without branches, because their outcome is hard to predict
+        indices[count] = i
+        x, y, z = xyz[i]
+        count += (low[0] <= x) & (x < high[0]) & (low[1] <= y) & (y < high[1]) & (low[2] <= z) & (z < high[2])
+    selected = np.empty((count, 3), xyz.dtype)
+    for i in range(count):
+        selected[i] = xyz[indices[i]]
+    return indices[:count].copy(), selected
 
 
 def crop_to_range(frame: PointCloud, low: Corner, high: Corner) -> tuple[np.ndarray, PointCloud]:
     """Crop a frame to low <= x y z < high; return the indices (M,) int64 and the cropped frame."""
-    indices = _find_indices_in_range(frame.xyz, np.array(low, np.float32), np.array(high, np.float32))
-    return indices, frame.take(indices)
+    indices, xyz = _select_in_range(
+        np.ascontiguousarray(frame.xyz), np.array(low, np.float32), np.array(high, np.float32)
+    )
+    intensity = None if frame.intensity is None else frame.intensity.take(indices)
+    return indices, replace(frame, xyz=xyz, intensity=intensity)
 
 
 def segment_view_ground(frame: PointCloud, params: GroundParams) -> np.ndarray:

@@ -114,7 +114,7 @@ def compute_height_above_plane(xyz: np.ndarray, plane: np.ndarray) -> np.ndarray
     return z - (plane[0] * x + plane[1] * y + plane[2])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _find_best_trial(sample, triples, distance, max_gradient, confidence):
     """Return the plane through a triple with the most inliers in the sample; NaN if there is none."""
     best_plane, best_count = np.full(3, np.nan), 0
@@ -146,7 +146,7 @@ def _find_best_trial(sample, triples, distance, max_gradient, confidence):
     return best_plane
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _compute_moments(xyz, plane, distance):
     """Sum the moments of the points within `distance` of the plane, relative to the first point.
 

@@ -33,6 +33,9 @@ class GroundSegmentation(ManagedNode):
     ~/output/ground, nonground and obstacles are computed only while there are subscribers.
     """
 
+    # Points (M, 3) in the level frame and mask (M,) of the ground, for the diagnostics.
+    last_segmented = np.zeros((0, 3), np.float32), np.zeros(0, bool)
+
     def __init__(self, **options: Any):
         super().__init__("ground_segmentation", GroundNodeParams(), GroundExtraParams(), **options)
 
@@ -74,16 +77,22 @@ class GroundSegmentation(ManagedNode):
         self._publish_parts(
             msg, visible_frame, visible_indices, params, ground if self.node_params.range == "all" else None
         )
-        plane = fit_plane(segmented_frame.xyz.compress(ground, axis=0))
-        if plane is not None:
-            inlier_fraction = compute_inlier_fraction(segmented_frame.xyz, plane)
-            self.diagnostics.counts.update(
-                plane=" ".join(f"{v:.4f}" for v in plane),
-                plane_inlier_share=f"{inlier_fraction:.3f}",
-                ground_share=f"{ground.mean():.3f}",
-            )
+        self.last_segmented = segmented_frame.xyz, ground
         problem = diagnose_empty(len(frame), ground) or self.sensor.find_problem(frame, params)
         self.diagnostics.report(WARN if problem else OK, problem or "segmenting")
+
+    def values(self) -> dict[str, Any]:
+        """Return the lifecycle state, and the plane through the ground of the last cloud."""
+        xyz, ground = self.last_segmented
+        plane = fit_plane(xyz.compress(ground, axis=0))
+        if plane is None:
+            return super().values()
+        return {
+            **super().values(),
+            "plane": " ".join(f"{v:.4f}" for v in plane),
+            "plane_inlier_share": f"{compute_inlier_fraction(xyz, plane):.3f}",
+            "ground_share": f"{ground.mean():.3f}",
+        }
 
     def _publish_parts(
         self, msg: Any, frame: PointCloud, indices: np.ndarray, params: Any, ground: np.ndarray | None

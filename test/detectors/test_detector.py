@@ -28,6 +28,25 @@ pytestmark = pytest.mark.usefixtures("one_thread", "carrier_too")
 each_version = pytest.mark.parametrize("version", VERSIONS)
 
 
+# view
+
+
+def test_view_selects_points_from_low_to_below_high():
+    rng = np.random.default_rng(0)
+    xyz = rng.integers(-3, 4, (500, 3)).astype(np.float32)  # many points are on the limits
+    xyz[::7, rng.integers(3)] = np.nan
+    low, high, height = (-2.0, -1.0, -2.0), (2.0, 3.0, 1.0), 2.73
+    source = PointCloud(xyz, rng.random(500, np.float32), 5, "lidar")
+    view = NormalizedView.of(source, SensorPoseParams(height=height), low, high)
+    moved = xyz + np.array([0, 0, height - 1.73], np.float32)
+    expected = np.flatnonzero(((moved >= low) & (moved < high)).all(axis=1))
+    np.testing.assert_array_equal(view.indices, expected)
+    np.testing.assert_array_equal(view.frame.xyz, moved[expected])
+    cropped = view.crop((0.0, *low[1:]), high)
+    np.testing.assert_array_equal(cropped.indices, expected[moved[expected, 0] >= 0])
+    assert len(cropped.frame.intensity) == len(cropped) and cropped.frame.frame_id == "lidar"
+
+
 # experts
 
 

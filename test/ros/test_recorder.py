@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 
 import pytest
@@ -85,6 +87,9 @@ def test_slow_recorder_drops_and_reports_messages(monkeypatch, start, tmp_path):
         assert node.diagnostics.counts["frames"] == 2 and node.diagnostics.counts["dropped"] == 8
         node._discover()
         assert "8 dropped" in node.diagnostics.state[1]
+        if sys.platform == "linux":
+            writer, others = (os.getpriority(os.PRIO_PROCESS, i) for i in (node.thread.native_id, 0))
+            assert writer == min(others + bag_recorder.WRITER_NICENESS, 19)
     finally:
         held.set()
         node.close()

@@ -22,6 +22,7 @@ from lidar_perception.detectors.fused.evidence import (
     compute_probabilities,
     compute_source_probabilities,
     find_silhouette_confidence,
+    fit_people,
     to_log_odds,
 )
 from lidar_perception.detectors.fused.fusion import Models, find_fusion, load_shipped_models
@@ -169,11 +170,15 @@ class FusedDetector(NetworkDetector):
         obstacles = flat_view.frame.take(np.flatnonzero(~is_flat_ground))
         ground_points = flat_view.frame.xyz.compress(is_flat_ground, axis=0)
         times.append(perf_counter())
+
+        def find_people() -> tuple[np.ndarray, np.ndarray]:
+            xyz, sensor_xyz = flat_view.frame.xyz, extended_view.source.xyz
+            ids = cluster_obstacles(xyz, is_flat_ground, params.people, sensor_xyz)[~is_flat_ground]
+            return ids, fit_people(obstacles.xyz, ground_points, ids)
+
         # Clustering runs in parallel: it releases the GIL, and much of PointPillars is single-threaded.
         with ThreadPoolExecutor(1) as pool:
-            clusters = pool.submit(
-                cluster_obstacles, flat_view.frame.xyz, is_flat_ground, params.people, extended_view.source.xyz
-            )
+            people = pool.submit(find_people)
             _, cluster_ids = run_experts(
                 view.frame, config, is_ground, view.take(cluster_ids), params.ground, params.clustering
             )
@@ -185,13 +190,13 @@ class FusedDetector(NetworkDetector):
                 replace(settings.nms, max_boxes=settings.max_proposals),
                 settings.cpu_fallback,
             )
-            people_ids = clusters.result()[~is_flat_ground]
+            people_ids, people_boxes = people.result()
         times.append(perf_counter())
         proposals = drop_ego_vehicle(proposal_result.detections, view.pose.height)
         evidence = {
             "network": to_log_odds(proposals.scores),
             "silhouette": to_log_odds(
-                find_silhouette_confidence(proposals.boxes, obstacles.xyz, ground_points, people_ids)
+                find_silhouette_confidence(proposals.boxes, obstacles.xyz, people_ids, people_boxes)
             ),
         }
         max_scores = compute_max_probabilities(models, proposals.class_ids, evidence, "classifier")

@@ -35,21 +35,30 @@ MIN_PROBABILITY, MAX_PROBABILITY = 0.001, 0.999  # each source's probability is 
 Evidence = dict[str, np.ndarray]
 
 
+def fit_people(xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndarray) -> np.ndarray:
+    """Fit boxes (J, 7) to clusters of people and extend them down to the ground.
+
+    Args:
+        xyz: (N, 3) points that are not ground.
+        ground: (G, 3) ground points.
+        cluster_ids: (N,) 1..J, 0 for no cluster, computed with the parameters for people.
+    """
+    return snap_to_ground(fit_boxes(xyz, cluster_ids, BEST.boxes.shape), fit_plane(ground))
+
+
 def find_silhouette_confidence(
-    boxes: np.ndarray, xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndarray
+    boxes: np.ndarray, xyz: np.ndarray, cluster_ids: np.ndarray, clusters: np.ndarray
 ) -> np.ndarray:
     """Return, for each box, the highest confidence that a nearby cluster is a pedestrian.
 
     Args:
         boxes: (K, 7) proposals.
-        xyz: (N, 3) points that are not ground.
-        ground: (G, 3) ground points.
-        cluster_ids: (N,) 1..J, 0 for no cluster, computed with the parameters `people`.
+        xyz, cluster_ids: as in fit_people().
+        clusters: (J, 7) its result.
 
     Returns:
         (K,) float64, 0..1; 0 for boxes without a cluster of a suitable size.
     """
-    clusters = snap_to_ground(fit_boxes(xyz, cluster_ids, BEST.boxes.shape), fit_plane(ground))
     indices = np.flatnonzero(
         (clusters[:, 5] >= MIN_HEIGHT_M)
         & (clusters[:, 5] <= MAX_HEIGHT_M)

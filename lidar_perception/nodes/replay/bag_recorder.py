@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import queue
+import sys
 import threading
 from functools import partial
 from typing import Any
@@ -22,6 +24,7 @@ from msg_utils.messages import load_message_class
 LATCHED = DurabilityPolicy.TRANSIENT_LOCAL
 DEPTH = 100  # queue depth of each subscription, large enough for a busy machine
 MAX_QUEUED = 256 * 2**20  # maximum number of bytes to be written; further messages are dropped and counted
+WRITER_NICENESS = 10  # added to that of the nodes, whose results would be late if compression took their core
 DISCOVERY_PERIOD_S = 0.2  # pause between searches for publishers of the remaining topics
 
 
@@ -161,6 +164,8 @@ class BagRecorder(LidarNode):
         self.queue.put(("message", topic, self.get_clock().now().nanoseconds, message, size))
 
     def _write(self) -> None:
+        if sys.platform == "linux":  # elsewhere the priority belongs to the process instead of this thread
+            os.setpriority(os.PRIO_PROCESS, 0, min(os.getpriority(os.PRIO_PROCESS, 0) + WRITER_NICENESS, 19))
         try:
             while (item := self.queue.get()) is not None:
                 what, topic, *rest = item
