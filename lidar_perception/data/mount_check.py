@@ -20,6 +20,8 @@ FLOOR_PLANE = ThresholdParams(max_slope=10.0)  # settings of the plane fit
 STEEP_FLOOR_PLANE = ThresholdParams(max_slope=30.0)  # settings of the plane fit for a tilted sensor
 MIN_CELLS = 10  # minimum number of cells with points to fit a plane
 MIN_FLOOR_FRACTION = 0.25  # minimum fraction of cells whose lowest point is on the plane
+MAX_BEYOND_FRACTION = 0.33  # maximum fraction of points beyond a plane overhead that is the floor of an inverted sensor
+MIN_BEYOND_M = 0.3  # minimum distance from such a plane of a point that counts as beyond it
 FIRST_CLOUDS = 3  # number of clouds to check at the start of a recording
 HEIGHT_TOLERANCE_M = 0.25  # tolerance between the parameter and the measured height
 MAX_TILT_DEG = 5.0  # maximum measured tilt that the slope of a road can explain
@@ -101,20 +103,27 @@ def find_mount_problem(recording: Recording, clouds: Sequence[PointCloud]) -> st
 
 def _find_floor(xyz: np.ndarray, params: ThresholdParams = FLOOR_PLANE) -> np.ndarray | None:
     """Return the plane z = a x + b y + c, (3,), of the ground in points (N, 3)."""
-    lowest = _find_lowest_points(xyz)
+    nearby = _select_nearby(xyz)
+    lowest = _find_lowest_points(nearby)
     if len(lowest) < MIN_CELLS:
         return None
     plane = fit_plane_by_ransac(lowest, params)
     if plane is None:
         return None
+    if plane[2] > 0 and (compute_height_above_plane(nearby, plane) > MIN_BEYOND_M).mean() > MAX_BEYOND_FRACTION:
+        return None
     on_plane = np.abs(compute_height_above_plane(lowest, plane)) <= params.inlier_distance
     return plane if on_plane.mean() >= MIN_FLOOR_FRACTION else None
 
 
-def _find_lowest_points(xyz: np.ndarray) -> np.ndarray:
-    """Return the lowest point in each cell around the sensor, (K, 3)."""
+def _select_nearby(xyz: np.ndarray) -> np.ndarray:
+    """Return the points (M, 3) between MIN_RANGE_M and MAX_RANGE_M."""
     squared_range = np.einsum("ij,ij->i", xyz[:, :2], xyz[:, :2])
-    nearby = xyz.compress((squared_range >= MIN_RANGE_M**2) & (squared_range <= MAX_RANGE_M**2), axis=0)
+    return xyz.compress((squared_range >= MIN_RANGE_M**2) & (squared_range <= MAX_RANGE_M**2), axis=0)
+
+
+def _find_lowest_points(nearby: np.ndarray) -> np.ndarray:
+    """Return the lowest point of each grid cell, (K, 3)."""
     side = 2 * round(MAX_RANGE_M / CELL_M) + 1
     column, row = np.floor((nearby[:, :2] + MAX_RANGE_M) / CELL_M).astype(np.int64).T
     cells = row * side + column

@@ -47,6 +47,14 @@ def test_leaning_sensor_of_a_recording_is_reported(lean):
     assert find_mount_problem(recording, []) is None
 
 
+def test_table_above_the_sensor_is_not_the_floor():
+    rng = np.random.default_rng(0)
+    table = rng.uniform((-6, -6, 0.28), (6, 6, 0.32), (3000, 3))
+    room = rng.uniform((-9, -9, 0.4), (9, 9, 2.2), (3000, 3))
+    assert abs(measure_sensor_height(table.astype(np.float32)) + 0.3) < 0.02
+    assert measure_sensor_height(np.concatenate([table, room]).astype(np.float32)) is None
+
+
 def test_height_problems_name_the_remedy():
     assert "set it to 0.60" in find_height_problem(0.6, SensorPoseParams())
     assert "upside down" in find_height_problem(-1.7, SensorPoseParams())
