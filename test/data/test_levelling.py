@@ -146,7 +146,7 @@ def test_missing_times_or_poses_are_reported(parts, cloud, words, tmp_path, monk
     "content, more, words",
     [
         (MOUNT.replace("0.9", "-9"), [], "ground.sensor_pose.height"),
-        ("[]", [], "is not a ROS parameter file"),
+        ("[]", [], "is not a parameter file"),
         ("/**: {ros__parameters: {autostart: true}}", [], "does not describe a mounting"),
         (
             "/**: {ros__parameters: {base_frame: base, crop: {body: [-1.0, -1.0, 0.0, 1.0, 1.0, 1.0]}}}",

@@ -80,7 +80,7 @@ def test_dask_cluster_gives_the_same_records(crowds, whole, tmp_path):
 
 def test_error_names_the_unreachable_scheduler(few, tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="needs the extra [distributed]")
-    monkeypatch.setattr(scoring_run, "CONNECT_S", 0.2)
+    monkeypatch.setattr(scoring_run, "CONNECT_TIMEOUT_S", 0.2)
     with pytest.raises(InputError, match="cannot reach a Dask scheduler"):
         run_experiment(SMALL, open_recording(few), tmp_path / "out", dask="tcp://127.0.0.1:9")
 
@@ -161,7 +161,7 @@ def test_error_names_the_changed_settings(few, tmp_path):
     out = tmp_path / "out"
     run_experiment(small(limits=(1, 2), deep={"a": 1, "b": 2}), open_recording(few), out)
     before = (out / journal.JOURNAL_NAME).read_bytes()
-    with pytest.raises(InputError, match=r"settings.deep.b 2, not 3; .*--force") as error:
+    with pytest.raises(InputError, match=r"settings.deep.b 2, not 3\).*--force") as error:
         run_experiment(small(limits=(1, 2), deep={"a": 1, "b": 3}), open_recording(few), out)
     assert "deep.a" not in str(error.value) and "limits" not in str(error.value)
     other = object_folder(tmp_path / "other", count=4)
@@ -228,7 +228,7 @@ def test_bug_in_experiment_ends_the_run(few, tmp_path, jobs, capfd):
     with pytest.raises((ZeroDivisionError, InputError)) as error:
         run_experiment(small(raise_bug), open_recording(few), tmp_path / "out", jobs=jobs)
     said = capfd.readouterr().err + "".join(getattr(error.value, "__notes__", []))
-    assert "while frame 000002 was measured" in said
+    assert "while processing frame 000002" in said
     assert '"000002"' not in "".join(read_lines(tmp_path / "out"))
 
 

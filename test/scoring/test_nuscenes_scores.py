@@ -288,7 +288,7 @@ def spoil(**values):
         (lambda r: r["s0k0"][0].pop("size"), "a box has no 'size'"),
         (spoil(detection_name="van"), "the class 'van' is not one of"),
         (spoil(attribute_name="red"), "is malformed"),
-        (spoil(size=[1, 2, 0]), "sizes above 0"),
+        (spoil(size=[1, 2, 0]), "sizes must be positive"),
         (spoil(rotation=[0, 0, 0, 0]), "a quaternion"),
         (spoil(translation=[1, 2, math.nan]), "must be finite"),
         (spoil(size=[1]), "is malformed"),

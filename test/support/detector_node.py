@@ -145,7 +145,7 @@ def _pointpillars_clouds():
         "no intensity": (cloud(xyz), "no intensity"),
         "a million": (cloud(rng.uniform(-50, 50, (1_000_000, 3)) * [1, 1, 0.05]), "no intensity"),
         "some NaN": (cloud(np.where(np.arange(len(xyz))[:, None] % 3, xyz, np.nan)), "no intensity"),
-        "all is ground": (message(1, ground=count.astype("u1") + 1), "is ground"),
+        "all is ground": (message(1, ground=count.astype("u1") + 1), "are ground"),
         "no clusters": (message(1, ground=count.astype("u1"), cluster_id=count.astype("u4")), "detecting"),
         "ids beyond int32": (
             message(1, cluster_id=(count + 2**32 - 1).astype("u4"), ground=count.astype("u1")),
@@ -175,7 +175,7 @@ def _pointnet_clouds():
 def _fused_clouds():
     return {
         "out of range": (cloud(frame().xyz + [500, 0, 0]), "network's range"),
-        "all is ground": (message(1, ground=np.ones(len(frame()), "u1")), "is ground"),
+        "all is ground": (message(1, ground=np.ones(len(frame()), "u1")), "are ground"),
     }
 
 
