@@ -19,13 +19,13 @@ from lidar_perception.ground.params import ClothParams, PatchworkParams
 
 @dataclass(frozen=True)
 class Peer:
-    """An algorithm of another package.
+    """An algorithm from another package.
 
     Attributes:
         name: Name in tables.
         package: Name on PyPI.
         module: Name of the module to import.
-        run: The algorithm, with the signature in the comment above its section of this module.
+        run: Function that runs it; the comment above each section of this module gives the signature.
     """
 
     name: str

@@ -54,7 +54,7 @@ def load_detector(
     min_score: float | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Detector:
-    """Load a detector, whose detector(cloud).detections are the objects in a cloud.
+    """Load a detector; detector(cloud).detections are the objects found in a cloud.
 
     Args:
         name_or_file: a detector with the weights of the package (fused, pointpillars or pointnet);

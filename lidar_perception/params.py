@@ -201,7 +201,7 @@ class PerceptionExtraParams(DetectionNodeParams):
 
 @dataclass(frozen=True)
 class TrackerExtraParams(CloudNodeParams):
-    """Additional parameters of tracker. Its queue is longer, so that no detections are skipped."""
+    """Additional parameters of the tracker node. Its input queue is longer, so that no detections are skipped."""
 
     input: ReceptionParams = ReceptionParams(queue=10)
     output: TrackMarkerParams = TrackMarkerParams()

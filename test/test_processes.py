@@ -125,7 +125,7 @@ def test_freed_memory_is_reused_unless_the_user_sets_malloc(user):
 
 
 @pytest.mark.parametrize("count", [1, 5, 57, 1001])
-def test_processes_get_consecutive_items_of_equal_number(count):
+def test_processes_get_equal_runs_of_consecutive_items(count):
     """Consecutive items share work, such as scans of one street or clouds of one chunk."""
     items = list(range(count))
     shares = [processes.deal_items(items, 3, job) for job in range(3)]

@@ -33,7 +33,7 @@ DETECTION_SETTINGS = {
     "drives": [SIMULATED_DRIVES, SCANS],
 }
 NO_MODELS: Mapping[str, TrainedModel] = {}
-EPOCHS = 120  # for recordings; our choice, because the text of the paper lacks Table 1 with the settings
+EPOCHS = 120  # our choice for recordings: Table 1 with the settings is missing from the paper's text
 
 
 def measure_segmented_frame(frames: Sequence[Frame], number: int) -> dict[str, Any]:

@@ -8,8 +8,8 @@ import sys
 
 def main() -> None:
     if sys.argv[1:2] == ["run"]:
-        # Runs before click and the rest are loaded. The node replaces this process and inherits the
-        # blocked signals, and those that have arrived.
+        # Handled before click and other modules are imported. The node replaces this process and inherits its
+        # signal mask and pending signals.
         from lidar_perception.nodes.main import STOP_SIGNALS
 
         signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)

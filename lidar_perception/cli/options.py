@@ -200,7 +200,7 @@ def parameter_options(
     nodes: Collection[str] | None = CANDIDATE_NODES,
     example: str = "stm.threshold=0.5",
 ) -> Callable:
-    """Decorator: --config and --set for one dataclass of parameters.
+    """Return a decorator that adds --config and --set for a dataclass of parameters.
 
     The function gets the dataclass as params=...
     """

@@ -46,7 +46,9 @@ class SqliteFile:
             (*ids, start, stop),
         ):
             if not isinstance(data, bytes) or not isinstance(time, int):
-                raise ValueError(f"a message is {type(data).__name__} at {time!r}")
+                raise ValueError(
+                    f"a row has data of type {type(data).__name__} and time {time!r} instead of bytes and an integer"
+                )
             yield topic, time, data
 
     def _read_topics(self) -> None:

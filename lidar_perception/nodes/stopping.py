@@ -38,7 +38,7 @@ class Stop:
         self._leaving = threading.Lock()
         self._awake, pipe = os.pipe()
         threading.Thread(target=self._wait, daemon=True).start()
-        # A descriptor, because a thread in sigwait(3) does not block the signals.
+        # Use signalfd: a thread that waits in sigwait(3) does not keep the signals blocked.
         mask = sum(1 << number - 1 for number in signals).to_bytes(128, "little")  # laid out as a sigset_t
         arrived, loaded = ctypes.CDLL(None).signalfd(-1, mask, os.O_CLOEXEC), threading.Event()
         listener = threading.Thread(target=_relay_first_signal, args=(arrived, loaded, pipe), daemon=True)

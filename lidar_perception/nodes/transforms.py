@@ -168,7 +168,7 @@ class Transforms:
     def _estimate_sweep_duration(self, cloud: Any) -> float:
         """Return the time from the stamp to the last point of a cloud, in seconds.
 
-        It is the time of the last deskewed cloud; before the first one, the time of this cloud.
+        Uses the duration of the last deskewed cloud; until a cloud has been deskewed, the duration of this one.
         """
         if self.sweep is None:
             try:

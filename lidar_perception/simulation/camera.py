@@ -34,7 +34,7 @@ def select_labels_in_view(truth: GroundTruth) -> GroundTruth:
 
 
 def select_labels(truth: GroundTruth) -> GroundTruth:
-    """Return the labelled objects in all directions."""
+    """Return the objects in all directions that are visible enough for a label."""
     return _select(truth, find_labelled(truth))
 
 

@@ -65,7 +65,7 @@ def compile_solids(solids: Solids, motion: Motion, salt: np.uint64) -> CompiledS
         density,
         transmission,
         reflectance,
-        reflectance.view(np.uint64),  # random for each part, and constant during a drive
+        reflectance.view(np.uint64),  # seed of the part: random per part, constant during a drive
         np.array(solids.owner),
         np.array(solids.semantic),
         (np.arange(len(solids), dtype=np.uint64) << np.uint64(32)) + salt,

@@ -72,7 +72,7 @@ def simulate_frames(
 
 
 def simulate_recording(seed: int, frames: int, sensor: Sensor = HDL64E, scenes: Scenes = ALL_STREETS) -> Recording:
-    """Return a recording of simulated drives, which has no files."""
+    """Return a recording of drives that are simulated in memory, without files."""
     content = {BOXES, POSES} | ({CAMERA} if scenes.camera else set())
     return Recording(
         Path("simulation"),

@@ -154,7 +154,7 @@ class TrackingParams(Params):
         300, "Maximum number of detections per frame; those with the highest scores are used.", low=1, high=10_000
     )
     max_tracks: int = param(300, "Maximum number of tracks.", low=1, high=10_000)
-    period: float = param(0.1, "Time between frames without stamps.", unit="s", low=0.001, high=10.0)
+    period: float = param(0.1, "Assumed period of frames without stamps.", unit="s", low=0.001, high=10.0)
     max_gap: float = param(
         1.0, "All tracks end when time jumps forward by more than this, or backward.", unit="s", low=0.01, high=100.0
     )

@@ -142,7 +142,7 @@ somebody_elses_node:
 
 
 def chosen(*arguments, tracking=False) -> dict:
-    """Return the arguments of a command with detector_options."""
+    """Return the values that a command with detector_options() receives."""
     made = {}
 
     @click.command(cls=Command)

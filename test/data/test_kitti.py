@@ -91,7 +91,7 @@ def test_empty_scan_is_read(tmp_path):
     assert read_velodyne(write(tmp_path / "empty.bin", b"")).shape == (0, 4)
 
 
-def test_image_size_is_that_of_the_file(tmp_path):
+def test_image_size_is_read_from_the_png(tmp_path):
     root = object_folder(tmp_path)
     write(root / "training/image_2/000001.png", png_header(640, 480))
     sizes = [(f.calibration().width, f.calibration().height) for f in open_recording(root)]

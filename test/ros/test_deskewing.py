@@ -127,4 +127,6 @@ def test_later_clouds_wait_for_the_end_of_their_sweep(start, first, begin, secto
             known = hear()
         while deliver(encode(message(xyz, stamp, time=seconds.astype("<f4"))), True):
             known = hear()
-    assert node.diagnostics.counts["deskewed"] == 7 - (first < 1.0)  # the duration is unknown at the second
+    assert node.diagnostics.counts["deskewed"] == 7 - (
+        first < 1.0
+    )  # after a partial first sweep the second cloud is not deskewed, because the duration is unknown

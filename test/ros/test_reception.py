@@ -38,7 +38,7 @@ TEXT = "std_msgs/msg/String"
 
 @contextmanager
 def driver(peer, reliability, count, points=KITTI, first=1, hz=10):
-    """Run a process without a Fast DDS profile, which sends clouds."""
+    """Run a process that publishes clouds, without a Fast DDS profile."""
     environment = {k: v for k, v in os.environ.items() if k not in PROFILE_VARIABLES}
     process = subprocess.Popen(
         [
@@ -310,7 +310,7 @@ def test_source_of_losses_is_named_after_it_has_ended(start, monkeypatch):
         ("/boxes", "array", "", "is the detector running", "is the detector overloaded"),
     ],
 )
-def test_problem_names_the_type_of_publisher(monkeypatch, topic, what, publisher, silent, slow):
+def test_reception_hint_depends_on_publisher(monkeypatch, topic, what, publisher, silent, slow):
     late = Late(monkeypatch, lambda stamp: 0.0, rate=10.0)
     late.reception.topic, late.reception.what = topic, what
     late.reception.last_publishers = [SimpleNamespace(node_namespace="/", node_name=publisher)] * bool(publisher)

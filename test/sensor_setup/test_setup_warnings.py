@@ -213,7 +213,7 @@ def test_clouds_in_ground_frame_are_recognised():
 
 
 @pytest.mark.parametrize("roll, pitch", [(0, 28), (180, -10)])
-def test_tilted_sensor_has_no_blind_sky_and_nearest_ground(roll, pitch):
+def test_tilt_does_not_affect_coverage_and_nearest_ground(roll, pitch):
     lean = make_tilted_pose(*np.radians([roll, pitch]))[:3, :3]
     m = measure(list(simulate_scans(turn=lean)), range(8))
     mount = m.mounting.mount

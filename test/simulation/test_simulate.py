@@ -222,7 +222,7 @@ def test_recorded_command_reproduces_data_set(tmp_path):
     assert content(again) == content(made)
 
 
-def test_other_sensor_of_same_name_is_not_resumed(tmp_path):
+def test_run_with_changed_sensor_file_is_not_resumed(tmp_path):
     sensor, out = tmp_path / "mine.yaml", tmp_path / "set"
     sensor.write_text("elevations: [2, -8]\nazimuth_step: 5\nrate: 10\n")
     options = ["--out", str(out), "--format", "kitti", "--sensor", str(sensor), "--frames", "1", "--jobs", "1"]

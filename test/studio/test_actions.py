@@ -196,7 +196,7 @@ def test_constant_motion_is_interpolated_exactly(start, velocity, motion, key_fr
 @given(
     st.tuples(st.floats(-1, 1), st.floats(-1, 1)), st.floats(-1.5, 1.5), frames, st.sampled_from([STANDING, DRIVING])
 )
-def test_correction_moves_all_boxes_without_key_boxes(shift, turn, frame, motion):
+def test_first_correction_moves_the_whole_track(shift, turn, frame, motion):
     expected = make_moving_boxes((5.0, 3.0), (1.0, 0.5), motion, PROPOSED)
     shifted_boxes = {}
     for f, box in expected.items():

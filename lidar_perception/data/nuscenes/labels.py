@@ -32,10 +32,10 @@ class NuscenesLabels:
     """K labels in the global frame.
 
     Attributes:
-        boxes: boxes with their numbers of LiDAR and radar points.
+        boxes: K boxes, with the total number of LiDAR and radar points in each.
         categories: (K,) int indices into category_names.
         lidar_points: (K,) int, number of LiDAR points in the box.
-        instances: (K,) int, number of the object, the same in all frames.
+        instances: (K,) int object ids, constant over the frames.
     """
 
     boxes: GlobalBoxes

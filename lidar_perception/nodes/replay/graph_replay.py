@@ -176,7 +176,7 @@ def replay(
         stage_ms = {node: float(ms) for node in graph if (ms := monitor.get_value(node, "processing_ms_median"))}
         codes = node_processes.stop(timeout=30)
     if failed := {node: code for node, code in codes.items() if code}:
-        errors.print(Text(f"exit codes {failed}", "red") + f"; see {out}/logs")
+        errors.print(Text(f"nodes failed with exit codes {failed}", "red") + f"; see {out}/logs")
     if monitor.frames == 0:
         raise InputError(f"{drive}: no cloud produced a result; see {out}/logs")
     return {

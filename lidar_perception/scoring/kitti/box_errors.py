@@ -59,7 +59,7 @@ def measure_heights(frames: list[ComparedFrame], name: str) -> dict[str, Any]:
     Returns:
         pairs: Number of matches.
         z_error_m: Median of detected minus labelled z of the centre, metres.
-        abs_z_error_m: Median of its absolute value.
+        abs_z_error_m: Median absolute error of z, metres.
         height_error_m: Median of detected minus labelled height.
         height_m: Median of the labelled height.
 

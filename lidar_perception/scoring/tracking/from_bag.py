@@ -27,7 +27,7 @@ def count_recorded_tracks(frames: Sequence[RecordedResult]) -> dict[str, int]:
 def score_recorded_tracks(
     frames: Sequence[RecordedResult], calibration: Calibration | None
 ) -> dict[str, dict[str, Any] | None]:
-    """Score recorded tracks and return "classes" of TrackingReport.compute.
+    """Score recorded tracks; return the entry "classes" of TrackingReport.compute().
 
     Raises:
         InputError: The labels have no track ids.
