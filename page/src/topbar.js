@@ -101,7 +101,7 @@ function showProgress() {
   byId("bar-accepted").style.flexGrow = accepted;
   byId("bar-rejected").style.flexGrow = rejected;
   byId("bar-left").style.flexGrow = tracks ? left : 1;
-  byId("progress-text").textContent = `${left} left · ${accepted} accepted · ${rejected} rejected · `
+  byId("progress-text").textContent = `${left} open · ${accepted} accepted · ${rejected} rejected · `
     + `${checked} of ${frames} frames checked`;
   if (byId("busy").hidden !== !busy) notify("busy");
   byId("busy").hidden = !busy;

@@ -6,7 +6,7 @@ import { element, icon } from "./dom.js";
 import { decideTrack } from "./edits.js";
 import { getBox, notify, on, select, store } from "./store.js";
 
-const FILTER_TITLES = { left: "Undecided", accepted: "Accepted", rejected: "Rejected", all: "All" };
+const FILTER_TITLES = { left: "Open", accepted: "Accepted", rejected: "Rejected", all: "All" };
 const STATE_BY_FILTER = { left: "proposed", accepted: "accepted", rejected: "rejected" };
 const ROW_PX = 34; // same height as in panels.css
 const list = document.getElementById("tracks");

@@ -46,7 +46,7 @@ def test_keys_accept_reject_and_reopen_and_update_the_progress(page, labels, per
         page.wait_for_function("s => document.getElementById('state').textContent === s", arg=state)
         progress = labels.state()["progress"]
         page.wait_for_function(
-            "s => document.getElementById('progress-text').textContent.startsWith(s)", arg=f"{progress['left']} left"
+            "s => document.getElementById('progress-text').textContent.startsWith(s)", arg=f"{progress['left']} open"
         )
 
 
