@@ -77,7 +77,7 @@ SKLEARN = (
     Peer("sklearn, n_jobs=-1", "scikit-learn", "sklearn", _make_sklearn_dbscan(-1)),
 )
 OPEN3D = Peer("Open3D", "open3d", "open3d", _run_open3d_dbscan)
-# Runs in a process of its own: its threads poll after the call and use a quarter of a core until the process ends.
+# Runs in a separate process: its threads poll after the call and use a quarter of a core until the process ends.
 WHEEL = Peer("dbscan", "dbscan", "dbscan", _run_dbscan_wheel)
 DBSCANS = (*SKLEARN, WHEEL, OPEN3D)
 

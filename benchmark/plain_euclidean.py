@@ -65,7 +65,7 @@ def _find_neighbours(tree: cKDTree, selected: np.ndarray, radius: float) -> Iter
 
 
 def _connect_leaders(tree: cKDTree, thresholds: np.ndarray, is_leader: np.ndarray) -> np.ndarray:
-    """Return the component (N,) of each leader (Eq. 8). Each follower is a component of its own."""
+    """Return the component (N,) of each leader (Eq. 8). Each follower is a separate component."""
     component = np.arange(tree.n)
     for i, j, squared in _find_neighbours(tree, is_leader, thresholds[is_leader].max(initial=0.0)):
         is_linked = is_leader[j] & (squared <= thresholds[i] ** 2)

@@ -22,6 +22,7 @@ from lidar_perception.cli.data import (
     open_and_describe,
     out_folder_option,
     path_option,
+    refuse_jobs_with_dask,
 )
 from lidar_perception.cli.options import Algorithm, Settings, apply_values, device_option, settings_options
 from lidar_perception.param_fields import collect_fields
@@ -123,8 +124,7 @@ def reproduce(
       ./lidar reproduce eg-pointpillars sim --budget 2 --out eg
     """
     name, data = _split_words(words, data)
-    if dask and jobs:
-        raise click.UsageError("--jobs and --dask cannot be combined; --jobs runs on this machine, --dask on others")
+    refuse_jobs_with_dask(bool(jobs), dask)
     from experiments.framework.report import group_skipped_frames, print_report, write_report
     from experiments.framework.runner import run_experiment, run_with_models
     from lidar_perception.runs.terminal import console

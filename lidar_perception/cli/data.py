@@ -193,6 +193,12 @@ class ScoringOptions:
         write_json(self.json_file, content)
 
 
+def refuse_jobs_with_dask(has_jobs: bool, dask: str | None) -> None:
+    """Raise UsageError if both --jobs and --dask are given."""
+    if has_jobs and dask:
+        raise click.UsageError("--jobs and --dask cannot be combined; --jobs runs on this machine, --dask on others")
+
+
 def scoring_options(data: Callable = data_argument(), *, parallel: bool = True) -> Callable:
     """Decorator: DATA, --split, --limit, --jobs, --dask and --json, which the function gets as
     options=ScoringOptions(...).
@@ -205,10 +211,7 @@ def scoring_options(data: Callable = data_argument(), *, parallel: bool = True) 
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
         def wrapper(*args: Any, data, split, limit, json_file, jobs=1, dask=None, **kwargs: Any) -> Any:
-            if dask and jobs > 1:
-                raise click.UsageError(
-                    "--jobs and --dask cannot be combined; --jobs runs on this machine, --dask on others"
-                )
+            refuse_jobs_with_dask(jobs > 1, dask)
             options = ScoringOptions(data, split, limit, jobs, dask, json_file)
             return function(*args, options=options, **kwargs)
 

@@ -18,6 +18,7 @@ from lidar_perception.cli.data import (
     open_and_describe,
     out_file_option,
     out_folder_option,
+    refuse_jobs_with_dask,
     split_option,
 )
 from lidar_perception.cli.options import detector_options
@@ -156,8 +157,7 @@ def detect(
     from lidar_perception.rendering.files import check_video
     from lidar_perception.tracking.drive_tracker import choose_ego_source
 
-    if dask and jobs > 1:
-        raise click.UsageError("--jobs and --dask cannot be combined; --jobs runs on this machine, --dask on others")
+    refuse_jobs_with_dask(jobs > 1, dask)
     if not track and (ego != "auto" or tracking != TrackingParams()):
         raise click.UsageError("--ego and --set tracking.* require --track")
     recording = open_and_describe(data, split=split, sensor_height=mount_height or None)

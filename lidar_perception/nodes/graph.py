@@ -100,7 +100,7 @@ def find_expert_range(detectors: Sequence[str], params: Mapping[str, Any]) -> st
 
     Returns:
         ahead or around if all detectors use that range; all if the ranges differ, or if a detector
-        needs the full cloud or has weights of its own.
+        needs the full cloud or has its own weights.
     """
     ranges = set()
     for name in detectors:

@@ -121,7 +121,7 @@ def may_have_labels(frame: Frame) -> bool:
 
 
 def _list_keys(frame: Frame) -> set[tuple[Path, str]]:
-    """Return keys (file, name in a bag) that identify a frame whatever path its recording was opened by."""
+    """Return keys (file, name in a bag) that identify a frame for any path to its recording."""
     if frame.points is not None:
         return {(frame.points.resolve(), "")}
     return {(file.resolve(), frame.name) for file in frame.files}

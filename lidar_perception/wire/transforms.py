@@ -39,7 +39,7 @@ def add_transforms(tree: TransformTree, msg: Any, static: bool) -> None:
 
 
 def add_odometry(tree: TransformTree, msg: Any) -> None:
-    """Add the pose of a nav_msgs/Odometry to a tree of its own, as the pose of MOVING in FIXED.
+    """Add the pose of a nav_msgs/Odometry to a separate tree, as the pose of MOVING in FIXED.
 
     Raises:
         InputError: The pose is invalid.
