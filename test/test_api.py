@@ -99,7 +99,7 @@ def test_error_names_the_bad_argument_in_one_line(call, words):
     assert "\n" not in str(error.value)
 
 
-def test_candidate_is_the_clicked_pedestrian():
+def test_candidates_include_the_clicked_pedestrian():
     xyz = scene(1)[:, :3]
     automatic = lp.find_candidates(xyz)
     assert set(automatic.class_ids.tolist()) <= {3, 4} or len(automatic) == 0

@@ -372,14 +372,14 @@ def test_mypy_ignores_no_module():
 
 
 @for_all(SOURCES)
-def test_modules_have_a_docstring_and_a_specific_name(name):
+def test_modules_have_docstrings_and_specific_names(name):
     assert ast.get_docstring(parse_source(name)), "no docstring"
     parts = Path(name).with_suffix("").parts
     assert not {"utils", "util", "helpers", "common", "misc"} & set(parts)
 
 
 @for_all(SOURCES)
-def test_no_source_has_more_than_the_maximum_of_lines(name):
+def test_source_files_have_at_most_400_lines(name):
     assert len((ROOT / name).read_text(encoding="utf-8").splitlines()) <= MAX_LINES
 
 
@@ -445,7 +445,7 @@ for case in sys.argv[1:]:
 
 
 @pytest.mark.parametrize("cases", LIGHT, ids=["core", "commands", "networks"])
-def test_importing_a_module_loads_no_unneeded_library(cases):
+def test_modules_do_not_import_unneeded_libraries(cases):
     result = subprocess.run(
         [sys.executable, "-c", IMPORT_SCRIPT, *map(" ".join, cases)],
         cwd=ROOT,

@@ -58,7 +58,7 @@ def test_contenders_run_in_turn_after_untimed_warm_up():
 
 
 @pytest.mark.parametrize("place", range(len(peers.DBSCANS)))
-def test_dbscan_peers_give_the_same_clusters(place):
+def test_dbscan_of_other_packages_gives_the_same_clusters(place):
     peer = peers.DBSCANS[place]
     if peer.find_problem():
         pytest.skip(f"{peer.package} is {peer.find_problem()}")
@@ -88,7 +88,7 @@ def test_same_clusters_compares_noise_and_core_partition():
     "unit, target, good, bad, text",
     [("x", 12, 12.0, 11.9, "12x"), ("ms", 60, 59.9, 60.0, "< 60 ms"), ("", 1.1, 1.0, 1.1, "< 1.1")],
 )
-def test_missed_target_is_shown(unit, target, good, bad, text):
+def test_missed_target_is_marked(unit, target, good, bad, text):
     assert make_row("a", value=good, unit=unit, target=target)["met"] is True
     assert make_row("a", value=bad, unit=unit, target=target)["met"] is False
     assert make_row("a", value=None, unit=unit, target=target)["met"] is None
@@ -203,7 +203,7 @@ def test_command_writes_the_measurements(nothing_installed, monkeypatch, tmp_pat
     assert content["dbscan_in_view"]["rows"][0]["same"] == 1
 
 
-def test_graph_rows_have_speed_and_cpu_time(drive_bag, monkeypatch, capsys):
+def test_graph_table_has_speed_and_cpu_time(drive_bag, monkeypatch, capsys):
     pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
     from benchmark.graph import RUNS, measure_graph, print_graph
     from lidar_perception.nodes.replay import graph_replay

@@ -36,7 +36,7 @@ def test_compilation_is_reported_by_the_outermost_block(report_all, capsys):
     assert compiling.COMPILING_MESSAGE in captured.err and captured.out == ""
 
 
-def test_calls_of_compiled_code_are_not_reported(monkeypatch):
+def test_calls_to_compiled_code_are_not_reported(monkeypatch):
     function = njit(lambda x: x + 1)
     function(1)
     monkeypatch.setattr(compiling, "REPORT_AFTER_S", 1e-9)
@@ -46,7 +46,7 @@ def test_calls_of_compiled_code_are_not_reported(monkeypatch):
         threading.Event().wait(0.01)  # time for the reporter to poll
 
 
-def test_wait_for_another_process_is_reported(report_all, tmp_path, monkeypatch):
+def test_waiting_for_another_process_is_reported(report_all, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     lines = []
     with open(tmp_path / f"lidar_perception-{os.getuid()}.lock", "w") as other:

@@ -122,7 +122,7 @@ def test_link_targets_exist(page):
             assert (page.parent / target).exists(), target
 
 
-def test_parameter_file_best_matches_the_code(generate):
+def test_best_parameter_file_matches_the_code(generate):
     from lidar_perception.candidates.configurations import BEST_VALUES
     from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.cli.options import read_config

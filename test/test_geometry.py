@@ -46,7 +46,7 @@ def test_is_within_is_half_open_and_false_for_nan(seed):
 
 
 @given(some_boxes)
-def test_corners_in_the_box_frame_are_half_the_size(box):
+def test_corners_in_the_box_frame_are_at_half_the_size(box):
     corners = box_corners(box[None])[0]
     np.testing.assert_allclose(to_box_frame(corners, box), SIGNS * box[3:6], rtol=0, atol=1e-10)
 
@@ -99,7 +99,7 @@ def test_points_on_the_faces_are_inside(x, y, yaw, margin):
 
 
 @given(some_boxes, seeds)
-def test_half_and_quarter_turns_of_a_box_keep_its_points(box, seed):
+def test_rotating_a_square_box_keeps_its_points(box, seed):
     rng = np.random.default_rng(seed)
     xyz = box[:3] + rng.uniform(-12, 12, (300, 3))
     assume((np.abs(np.abs(to_box_frame(xyz, box)) - box[3:6] / 2) > 1e-6).all())
@@ -212,14 +212,14 @@ def test_in_view_equals_the_float64_projection(seed):
 
 
 @given(seeds)
-def test_both_directions_of_the_pose_give_the_same_camera(seed):
+def test_camera_accepts_its_pose_in_either_direction(seed):
     camera, rotation, translation, p = make_camera(np.random.default_rng(seed))
     inverse = rotation.inv()
     other = Camera.from_lidar_pose(p, inverse.as_quat(), -inverse.apply(translation), WIDTH, HEIGHT)
     np.testing.assert_allclose(other.projection, camera.projection, rtol=0, atol=1e-9)
 
 
-def test_the_image_includes_its_left_and_top_border_only():
+def test_image_includes_its_left_and_top_border_only():
     camera = Camera(np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]]), 2, 1)  # u = -y / x
     xyz = np.float32([[4, 0, 0], [4, -8, 0], [4, -7.99, 0], [4, 0, -4], [4, 0, -3.99], [4, 0.01, 0], [4, 0, 0.01]])
     assert camera.in_view(xyz).tolist() == [True, False, True, False, True, False, False]

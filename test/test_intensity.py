@@ -71,7 +71,7 @@ def test_full_scale_depends_on_values_and_type(values, kind, full):
         assert infer_full_scale(values.astype(kind).astype(np.float32), kind) == full
 
 
-def test_few_broken_values_do_not_change_the_scale():
+def test_few_invalid_values_do_not_change_the_scale():
     many = np.tile(UNIT, 10)
     many[:2] = 1e30, 40000.0
     assert infer_full_scale(many) == 1.0 and find_scale_problem(many) is None
@@ -86,14 +86,14 @@ def test_to_unit_keeps_regular_values_and_zeroes_invalid_ones():
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2], [2, 0, 1], [1, 2, 0]])
-def test_the_scale_of_a_stream_never_falls(order):
+def test_scale_of_a_stream_never_decreases(order):
     clouds = [UNIT, WHOLE[255], np.float32([0, 1, 1.2])]
     scale = StreamScale()
     found = [scale(clouds[i]) for i in order]
     assert found == sorted(found) and scale.full_scale == 255.0
 
 
-def test_dark_clouds_have_the_scale_of_their_stream():
+def test_dark_clouds_use_the_scale_of_their_stream():
     """The scale of one node does not affect another node."""
 
     def message(values, stamp):
@@ -116,7 +116,7 @@ def test_dark_clouds_have_the_scale_of_their_stream():
 
 
 @pytest.mark.parametrize("full", [100, 255, 1023, 4095, 65535])
-def test_a_wrong_scale_is_reported_with_the_remedy(full):
+def test_wrong_scale_is_reported_with_remedy(full):
     values = UNIT * np.float32(full)
     assert guess_scale(values) == full
     problem = find_scale_problem(values)
@@ -184,7 +184,7 @@ def test_every_entry_point_rejects_invalid_clouds(points, remedy):
         assert r"(N, 3) [x y z]" in str(error.value) and "\n" not in str(error.value)
 
 
-def test_clouds_of_three_and_four_columns_give_equal_frames():
+def test_every_form_of_a_cloud_gives_an_equal_frame():
     plain = PointCloud.of(CLOUD[:, :3])
     four = PointCloud.of(CLOUD, stamp_ns=5, frame_id="velodyne")
     assert plain.intensity is None and (four.stamp_ns, four.frame_id) == (5, "velodyne")
@@ -267,7 +267,7 @@ def test_clusters_of_an_array_equal_those_of_its_frame():
         ("box", "type str"),
     ],
 )
-def test_boxes_of_another_shape_are_refused(boxes, said):
+def test_boxes_of_wrong_shape_are_rejected(boxes, said):
     with pytest.raises(InputError, match=f"boxes .*{said}"):
         Detections.of(boxes)
 

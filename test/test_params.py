@@ -224,12 +224,12 @@ def test_parameters_cannot_be_changed_in_place(group, f):
 
 
 @pytest.mark.parametrize("limits, eps", [((), (0.2,)), ((10.0,), (0.1, 0.2))])
-def test_dbscan_takes_any_number_of_bands(limits, eps):
+def test_dbscan_accepts_any_number_of_bands(limits, eps):
     made = DbscanParams(range_limits=list(limits), eps=list(eps))
     assert (made.range_limits, made.eps) == (limits, eps)
 
 
-def test_eps_has_one_value_more_than_range_limits():
+def test_eps_must_have_one_value_more_than_range_limits():
     for eps in [(), (0.1, 0.2), (0.1, 0.2, 0.3, 0.4)]:
         with pytest.raises(ValueError, match=f"eps has {len(eps)} values for 2 range_limits"):
             DbscanParams(eps=eps)
@@ -260,13 +260,13 @@ def test_error_of_with_values_names_the_group():
         with_values(PipelineParams(), {"clustering.dbscan.min_samples": 0})
 
 
-def test_a_node_declares_the_parameters_of_the_pipeline():
+def test_node_declares_the_parameters_of_the_pipeline():
     whole = collect_fields(PipelineParams())
     parts = [collect_fields(kind()) for kind in (GroundNodeParams, ClusteringNodeParams, RefinementNodeParams)]
     assert {k: v for part in parts for k, v in part.items()} == whole
 
 
-def test_a_config_may_be_nested_or_dotted(tmp_path):
+def test_parameter_file_may_be_nested_or_dotted(tmp_path):
     nested = config(
         tmp_path,
         """
@@ -293,7 +293,7 @@ perception:
     assert with_values(PipelineParams(), nested).clustering.dbscan == DbscanParams(eps=(0.1, 0.2, 0.3), min_samples=5)
 
 
-def test_every_parameter_can_come_from_a_config(tmp_path):
+def test_each_parameter_can_be_set_in_a_file(tmp_path):
     text = "node:\n  ros__parameters:\n" + "".join(
         f"    {name}: {list(value) if isinstance(value, tuple) else repr(value)}\n"
         for name, value in flatten(PlayerParams()).items()
@@ -301,7 +301,7 @@ def test_every_parameter_can_come_from_a_config(tmp_path):
     assert with_values(PlayerParams(), config(tmp_path, text, PlayerParams())) == PlayerParams()
 
 
-def test_a_config_may_have_parameters_of_other_nodes(tmp_path):
+def test_parameters_of_other_nodes_in_a_file_are_ignored(tmp_path):
     values = config(
         tmp_path,
         """
@@ -313,7 +313,7 @@ silent: {ros__parameters: }
     assert values == {"clustering.dbscan.min_samples": 7}
 
 
-def test_an_empty_config_sets_nothing(tmp_path):
+def test_empty_parameter_file_sets_nothing(tmp_path):
     assert config(tmp_path, "# nothing yet\n") == {}
 
 
@@ -329,7 +329,7 @@ def test_an_empty_config_sets_nothing(tmp_path):
         ("perception", ("not a parameter file",)),
     ],
 )
-def test_error_of_an_invalid_config_names_the_file(tmp_path, text, words):
+def test_error_of_an_invalid_parameter_file_names_it(tmp_path, text, words):
     with pytest.raises(InputError) as error:
         config(tmp_path, text)
     message = str(error.value)
@@ -337,7 +337,7 @@ def test_error_of_an_invalid_config_names_the_file(tmp_path, text, words):
     assert all(word in message for word in words)
 
 
-def test_error_of_an_unreadable_config_names_the_file(tmp_path):
+def test_error_of_an_unreadable_parameter_file_names_it(tmp_path):
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00a")
     for name in ("missing.yaml", "binary.yaml", "."):
         with pytest.raises(InputError, match="cannot read the parameter file"):

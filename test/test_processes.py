@@ -94,7 +94,7 @@ def test_ended_processes_release_system_resources():
     assert (run.returncode, run.stderr) == (0, "")
 
 
-def test_a_process_that_ignores_sigterm_is_killed(monkeypatch):
+def test_process_that_ignores_sigterm_is_killed(monkeypatch):
     monkeypatch.setattr(processes, "EXIT_TIMEOUT_S", 0.2)
     results = processes.run_in_order(ignore_sigterm, itertools.count(), 2, 2, "worked")
     stuck = [next(results), next(results)]
@@ -106,7 +106,7 @@ def test_a_process_that_ignores_sigterm_is_killed(monkeypatch):
 
 @pytest.mark.skipif(os.confstr("CS_GNU_LIBC_VERSION") is None, reason="not glibc")
 @pytest.mark.parametrize("user", [{}, {"MALLOC_TRIM_THRESHOLD_": "131072"}], ids=["default", "set by the user"])
-def test_freed_memory_is_reused_unless_the_user_sets_malloc(user):
+def test_freed_memory_is_reused_unless_malloc_is_configured(user):
     """Count the page faults of repeated allocations."""
     script = (
         "import resource\n"

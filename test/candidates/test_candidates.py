@@ -35,7 +35,7 @@ def make_labelled_points(seed):
 
 
 @given(seeds, st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-20, 20))
-def test_snapping_lowers_bottoms_to_the_plane_and_keeps_tops(seed, a, b, c):
+def test_snapping_extends_boxes_down_to_the_plane(seed, a, b, c):
     boxes = fit_boxes(*make_labelled_points(seed), "axis_aligned")
     original = boxes.copy()
     snapped = snap_to_ground(boxes, np.array([a, b, c]))
@@ -50,7 +50,7 @@ def test_snapping_lowers_bottoms_to_the_plane_and_keeps_tops(seed, a, b, c):
     np.testing.assert_allclose(snap_to_ground(snapped, np.array([a, b, c])), snapped, rtol=0, atol=2e-5)
 
 
-def test_the_height_filter_includes_the_tolerance():
+def test_height_filter_includes_its_tolerance():
     boxes = np.zeros((5, 7), np.float32)
     boxes[:, 5] = [1.25, 1.5, 1.75, 2.0, 2.25]
     assert select_by_height(boxes, 1.75, HeightParams(tolerance=0.25)).tolist() == [False, True, True, True, False]
@@ -91,7 +91,7 @@ def test_stages_are_subsets_of_the_first_stage():
             assert (stage.class_ids == PEDESTRIAN).all()
 
 
-def test_threshold_0_accepts_every_cluster_and_1_only_the_seed():
+def test_threshold_0_accepts_all_clusters_and_1_only_the_seed():
     segmented = segment_cloud(PointCloud(scene()))
     k = segmented.cluster_ids[np.argmin(np.linalg.norm(segmented.xyz - [7, 2, -1], axis=1))]
     seed = seed_from_points(segmented.xyz[segmented.cluster_ids == k], segmented.boxes[k - 1])
@@ -112,7 +112,7 @@ def test_augmentation_changes_scores_from_15_to_30_metres_only():
     assert differs.any() and not differs[(ranges < 15) | (ranges >= 30)].any()
 
 
-def test_the_threshold_applies_to_each_stages_own_scores():
+def test_threshold_applies_to_the_scores_of_each_stage():
     segmented = segment_cloud(PointCloud(scene()))
     seed = make_fixed_source(*make_truth_source(boxes_at(PEOPLE))(segmented))
     unfiltered = refine_segmented(segmented, seed, make_params(0.0))
@@ -144,7 +144,7 @@ def test_refining_without_clusters_finds_no_candidates():
 
 
 @needs_data
-def test_the_seeds_own_cluster_passes_every_stage():
+def test_seed_cluster_passes_every_stage():
     frame_count = 0
     for frame in open_recording(DATA / "kitti_object").frames[:12]:
         truth = frame.truth().select_class(PEDESTRIAN)
@@ -163,7 +163,7 @@ def test_the_seeds_own_cluster_passes_every_stage():
     assert frame_count > 0
 
 
-def test_candidates_keep_the_ids_of_a_foreign_clustering():
+def test_candidates_keep_the_ids_of_given_clusters():
     """Ids may have gaps and be huge; the candidates are the same as for 1..K."""
     frame = PointCloud(scene())
     segmented = segment_cloud(frame)

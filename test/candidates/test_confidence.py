@@ -85,7 +85,7 @@ def test_spreading_points_makes_silhouettes_independent_of_range():
 
 
 @given(seeds)
-def test_a_metric_silhouette_moves_with_the_ground(seed):
+def test_metric_silhouette_is_relative_to_the_ground(seed):
     rng = np.random.default_rng(seed)
     xyz = make_board(rng.uniform(5, 30), bearing=0.0) + rng.normal(0, 0.02, (1, 3)).astype(np.float32)
     shift = np.float32(rng.integers(-8, 8) / 4)  # exact in float32
@@ -121,7 +121,7 @@ def test_shifts_return_the_best_score_of_the_shifted_images(seed, shifts):
     assert similarity[0] == pytest.approx(expected, abs=1e-12)
 
 
-def test_seen_only_ignores_hidden_legs():
+def test_seen_only_compares_visible_parts_of_silhouettes():
     person = make_board(12.0, width=0.4)
     is_leg = person[:, 2] < FLOOR + 0.8
     upper_body = person[~is_leg]
@@ -137,7 +137,7 @@ def test_seen_only_ignores_hidden_legs():
     assert reverse_similarity == pytest.approx(similarities[1], abs=1e-12)  # symmetric in the hidden image
 
 
-def test_pca_axis_corrects_a_tilt_and_yaw_does_not():
+def test_only_the_pca_axis_corrects_a_tilt():
     rng = np.random.default_rng(0)
     upright_points = rng.normal(size=(600, 3)) * [0.05, 0.2, 0.6] + [10, 0, 0]
     angle = 0.5
@@ -196,17 +196,17 @@ def test_features_do_not_depend_on_other_clusters(seed):
         assert confidence.shape == (4,) and ((confidence > 0) & (confidence < 1)).all()
 
 
-def test_no_clusters_give_empty_features():
+def test_features_of_no_clusters_are_empty():
     features = compute_shape_features(np.zeros((0, 3), np.float32), np.array([0]), np.zeros((0, 7)), BEST)
     assert all(v.shape == (0,) for v in features.values()) and compute_confidence(features).shape == (0,)
 
 
-def test_a_single_point_has_finite_features():
+def test_single_point_has_finite_features():
     shape = compute_features([np.float32([[9, 0, -1]])], [make_box(9.0)])
     assert all(np.isfinite(v).all() for v in shape.values()) and np.isfinite(compute_confidence(shape))[0]
 
 
-def test_every_curve_exists_and_rises_with_similarity():
+def test_all_curves_exist_and_similarity_increases_confidence():
     models = _load_models()
     assert set(models["shape"]["curves"]) == set(SHAPE_KNOTS)
     assert set(models["seed"]["curves"]) == set(SHAPE_KNOTS) | set(SEED_KNOTS)
@@ -225,7 +225,7 @@ def make_two_people():
     return xyz, np.array([0, first, len(xyz)]), np.concatenate([make_box(9.0), make_box(9.0)])
 
 
-def test_seed_cluster_is_found_by_the_seeds_points():
+def test_seed_cluster_contains_points_of_the_seed():
     xyz, start, boxes = make_two_people()
     seed = seed_from_points(xyz[: start[1]], boxes[0])
     assert find_seed_cluster(seed, xyz, start).tolist() == [True, False]
@@ -257,7 +257,7 @@ def test_confirmed_seed_has_confidence_1(is_confirmed):
 # --- the configuration ---------------------------------------------------------------------
 
 
-def test_configuration_best_accepts_clusters_by_confidence():
+def test_best_configuration_accepts_clusters_by_confidence():
     people = [make_board(8.0), make_board(16.0), make_board(11.0, width=1.8)]
     xyz = np.concatenate([p + np.float32([0, 6 * i - 6, 0]) for i, p in enumerate(people)])
     rng = np.random.default_rng(0)
@@ -275,7 +275,7 @@ def test_configuration_best_accepts_clusters_by_confidence():
     assert sorted(some.scores) == sorted(all_.scores[all_.scores >= np.float32(limit)])
 
 
-def test_automatic_seed_is_most_likely_cluster_or_template():
+def test_automatic_seed_is_the_best_cluster_or_the_template():
     template = load_seed()
     params = with_values(BEST, {"view.enabled": False})
     empty = segment_cloud(PointCloud(np.zeros((0, 3), np.float32)), params=params)
@@ -297,7 +297,7 @@ def test_automatic_seed_is_most_likely_cluster_or_template():
 
 
 @needs_data
-def test_best_finds_more_real_pedestrians_than_paper():
+def test_best_configuration_finds_more_real_pedestrians():
     hits = dict.fromkeys(("paper", "best"), 0)
     for frame in open_recording(DATA / "kitti_object"):
         truth = frame.truth().select_class(PEDESTRIAN)

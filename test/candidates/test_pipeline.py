@@ -54,7 +54,7 @@ def test_cloud_without_a_seed_raises_input_error():
 WITH_VIEW = PipelineParams(view=ViewParams(enabled=True))
 
 
-def test_error_of_a_view_without_a_camera_names_the_remedy():
+def test_error_for_missing_camera_names_the_remedy():
     with pytest.raises(InputError, match=r"view\.enabled"):
         find_candidates(PointCloud(scene()), make_template_source(), params=WITH_VIEW)
 
@@ -78,7 +78,7 @@ def test_restricted_view_equals_pipeline_on_cropped_points():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_order_of_the_points_does_not_matter(seed):
+def test_order_of_the_points_does_not_matter(seed):
     xyz = scene()
     order = np.random.default_rng(seed).permutation(len(xyz))
     segmented, candidates = find_candidates(PointCloud(xyz), make_template_source())
@@ -103,7 +103,7 @@ def test_ground_points_have_no_cluster_and_ids_match_boxes():
     "xyz", [np.zeros((0, 3)), floor(), person(6, 0, count=9)], ids=["empty", "only ground", "nine points"]
 )
 @pytest.mark.parametrize("min_confidence", [0.0, 0.5])
-def test_the_automatic_seed_falls_back_to_the_template(xyz, min_confidence):
+def test_automatic_seed_falls_back_to_the_template(xyz, min_confidence):
     params = with_values(PipelineParams(), {"seed.min_confidence": min_confidence, "clustering.dbscan.min_samples": 3})
     template_seed = seed_from_points(person(7, 2).astype(np.float32), boxes_at([[7, 2]])[0])
     assert make_automatic_source([template_seed], params)(

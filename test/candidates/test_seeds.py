@@ -88,7 +88,7 @@ def test_seed_from_click_needs_a_cluster_within_the_radius():
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])
-def test_click_that_is_far_away_or_not_finite_is_rejected(axis, value):
+def test_distant_or_non_finite_click_is_rejected(axis, value):
     xyz, labels, boxes = make_clicked_scene()
     click = np.array([6, 0.2, -1.0])
     click[axis] = value
@@ -179,7 +179,7 @@ def test_error_of_an_unreadable_template_names_the_file(tmp_path):
             load_seed(path)
 
 
-def test_the_packaged_template_is_a_pedestrian():
+def test_packaged_template_is_a_pedestrian():
     seed = load_seed()
     assert 1.4 < seed.height < 2.1
     pixels = to_pixels(seed.draw_silhouette())

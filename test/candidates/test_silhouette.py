@@ -75,7 +75,7 @@ def measure_radial_alignment(xyz):
 
 
 @given(seeds)
-def test_silhouettes_of_random_clusters_equal_plain_ones(seed):
+def test_silhouettes_of_random_clusters_equal_the_reference(seed):
     rng = np.random.default_rng(seed)
     clusters = [make_cluster(rng) for _ in range(4)]
     scales = np.column_stack([np.ones(4), rng.uniform(0, 1, (4, 3))])
@@ -88,7 +88,7 @@ def test_silhouettes_of_random_clusters_equal_plain_ones(seed):
 
 
 @needs_data
-def test_silhouettes_of_real_clusters_equal_plain_ones():
+def test_silhouettes_of_real_clusters_equal_the_reference():
     values = np.fromfile(sorted(SCANS.glob("*.bin"))[4], np.float32).reshape(-1, 4)
     segmented = segment_cloud(PointCloud(np.ascontiguousarray(values[:, :3])))
     ids = range(1, segmented.cluster_ids.max() + 1)
@@ -98,7 +98,7 @@ def test_silhouettes_of_real_clusters_equal_plain_ones():
             np.testing.assert_array_equal(to_pixels(draw_silhouette(points, scales)), draw_plainly(points, scales))
 
 
-def test_the_window_fits_the_cluster_and_row_0_is_its_top():
+def test_window_fits_the_cluster_and_row_0_is_its_top():
     # An L as seen from the sensor: upright on the left, foot to the right.
     upright = np.column_stack([np.full(60, 9.0), np.full(60, 0.5), np.linspace(0, 1.8, 60)])
     foot = np.column_stack([np.full(60, 9.0), np.linspace(-0.5, 0.5, 60), np.zeros(60)])
@@ -165,7 +165,7 @@ def test_moving_along_the_ray_keeps_the_silhouette(seed, factor):
 
 
 @given(seeds)
-def test_a_mirrored_cluster_has_the_mirrored_silhouette(seed):
+def test_mirrored_cluster_has_the_mirrored_silhouette(seed):
     # Left and right are exchanged. Pixels are half-open, so the images are not bit-equal.
     xyz = make_cluster(np.random.default_rng(seed), 300)
     if measure_radial_alignment(xyz) < 0.999:
@@ -193,7 +193,7 @@ def test_augmentation_only_adds_pixels(seed, steps):
         np.testing.assert_array_equal(augmented, original)
 
 
-def test_scales_are_those_of_the_paper():
+def test_augmentation_scales_match_the_paper():
     ranges = np.array([0, 14.999, 15, 22, 29.999, 30, 31, 1e5])
     in_range = [False, False, True, True, True, False, False, False]
     scales = compute_cpa_scales(ranges, CpaParams())
@@ -213,7 +213,7 @@ def test_scale_decreases_in_steps_down_to_min_scale():
     )
 
 
-def test_zero_steps_or_clusters_give_empty_arrays_of_right_shape():
+def test_zero_steps_or_clusters_give_empty_arrays():
     np.testing.assert_array_equal(compute_cpa_scales(np.array([5.0, 20.0]), CpaParams(steps=0)), np.ones((2, 1)))
     assert compute_cpa_scales(np.zeros(0), CpaParams()).shape == (0, 3)
     images = draw_silhouettes(np.zeros((0, 3), np.float32), np.array([0]), np.ones((0, 3)))
@@ -229,20 +229,20 @@ def test_coincident_points_set_the_top_left_pixel(at, scales):
         assert pixels[:2, :2].all() and pixels.sum() == 4
 
 
-def test_a_vertical_line_fills_the_first_column():
+def test_vertical_line_fills_the_first_column():
     line = np.float32([8, 2, 0]) + np.linspace(-1.5, 0.5, 400, dtype=np.float32)[:, None] * np.float32([0, 0, 1])
     pixels = to_pixels(draw_silhouette(line))
     assert pixels[:, :2].all() and not pixels[:, 2:].any()
     np.testing.assert_array_equal(pixels, draw_plainly(line))
 
 
-def test_a_horizontal_line_fills_the_first_row():
+def test_horizontal_line_fills_the_first_row():
     line = np.float32([8, 0, -1]) + np.linspace(-1, 1, 200, dtype=np.float32)[:, None] * np.float32([0, 1, 0])
     pixels = to_pixels(draw_silhouette(line))
     assert pixels[:2].all() and not pixels[2:].any()
 
 
-def test_the_input_is_not_modified():
+def test_input_is_not_modified():
     xyz = make_cluster(np.random.default_rng(0), 50)
     original, scales = xyz.copy(), np.array([[1.0, 0.9]])
     draw_silhouettes(xyz, np.array([0, 50]), scales)

@@ -126,7 +126,7 @@ def test_bag_without_clouds_is_bad_input(tmp_path, monkeypatch, capsys):
         assert "has no frames" in error_line(capsys)
 
 
-def test_missing_pedestrian_is_reported_and_old_scores_are_kept(tmp_path, monkeypatch, capsys):
+def test_missing_pedestrian_is_reported_and_scores_file_is_kept(tmp_path, monkeypatch, capsys):
     root = object_folder(tmp_path / "kitti", "")
     write(tmp_path / "s.json", "those from before")
     assert exit_of(monkeypatch, "evaluate", "candidates", "--data", root, "--json", tmp_path / "s.json") == 2

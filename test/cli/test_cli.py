@@ -53,7 +53,7 @@ def test_help_of_every_command_has_an_example(words):
     assert "Usage: " in text and "Example" in text and f"lidar-perception {' '.join(words)}" in text
 
 
-def test_the_overview_shows_every_command():
+def test_overview_shows_every_command():
     text = run("--help")
     assert {words[0] for words, _ in LEAVES} == {*COMMANDS}
     for name, (_, summary) in COMMANDS.items():
@@ -189,7 +189,7 @@ def test_info_shows_topics_types_counts_and_length(bag):
     assert "0.1 s" in text
 
 
-def test_scores_are_those_of_the_two_pedestrians(kitti, tmp_path):
+def test_evaluate_scores_both_pedestrians(kitti, tmp_path):
     content = evaluate(tmp_path, "--data", kitti)
     assert (content["frames"], content["ground_truth"], content["skipped"]) == (2, 2, [])
     assert content["ground_truth_by_range"] == {r: 2 if r == "0-15" else 0 for r in RANGES}
@@ -210,7 +210,7 @@ def test_converted_bag_scores_like_its_folder(kitti, bag, tmp_path):
     assert scores(evaluate(tmp_path, "--data", bag)) == scores(evaluate(tmp_path, "--data", kitti))
 
 
-def test_evaluate_prints_the_scores_that_it_writes(bag, tmp_path, monkeypatch):
+def test_printed_and_written_scores_agree(bag, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     text = run("evaluate", "candidates", "--data", bag, "--png", tmp_path / "a/picture.png")
     assert "2 pedestrians in 2 frames" in text
@@ -222,7 +222,7 @@ def test_evaluate_prints_the_scores_that_it_writes(bag, tmp_path, monkeypatch):
     [words for words, command in LEAVES if {"data", "data_option"} <= {p.name for p in command.params}],
     ids=" ".join,
 )
-def test_data_is_an_argument_and_data_option_is_the_same(words, tmp_path, monkeypatch, capsys):
+def test_data_argument_and_data_option_are_equivalent(words, tmp_path, monkeypatch, capsys):
     needs_out = "detect", "setup", "train", "seed"
     out = ("--out", tmp_path / "out") if words[0] in needs_out else ()
     results = ("--results", tmp_path / "r.json") if words[-1] == "nuscenes" else ()
@@ -259,7 +259,7 @@ def test_cloud_without_core_points_has_no_candidates(bag, tmp_path):
         assert row["centre_error_m"] is None
 
 
-def test_a_frame_that_cannot_be_read_is_counted_as_skipped(kitti, tmp_path):
+def test_frame_that_cannot_be_read_is_counted_as_skipped(kitti, tmp_path):
     root = object_folder(tmp_path / "kitti", walker_label(), count=3)
     write(root / "training/velodyne/000001.bin", b"123")
     content = evaluate(tmp_path, "--data", root)

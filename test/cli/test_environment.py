@@ -39,7 +39,7 @@ needs_pip = pytest.mark.skipif(not INSTALLED.is_dir(), reason="needs the package
 
 
 @needs_pip
-def test_path_gets_only_the_lidar_command():
+def test_only_the_lidar_command_is_added_to_path():
     """Node executables are in lib/, where ros2 run and ros2 launch look, because names such as `tracker` are
     common."""
     assert {path.name for path in INSTALLED.iterdir()} == set(NODES)
@@ -58,7 +58,7 @@ def test_executable_starts_the_node_of_its_name(name, tmp_path):
     assert done.stdout.startswith(f"Usage: {name} --ros-args")
 
 
-def test_closed_pipe_ends_help_without_error():
+def test_help_into_a_closed_pipe_ends_without_error():
     command = [sys.executable, "-m", "lidar_perception.nodes.main", "perception", "--help"]
     with subprocess.Popen(
         command, env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE

@@ -61,7 +61,7 @@ def test_set_changes_parameters_of_the_pipeline(bag, tmp_path, flags):
 
 
 @pytest.mark.no_cover
-def test_config_equals_set_and_set_takes_precedence(bag, tmp_path):
+def test_set_takes_precedence_over_config(bag, tmp_path):
     few, many = (given(f"clustering.dbscan.min_samples={n}") for n in (10, 100_000))
     file = write(tmp_path / "p.yaml", "/**:\n  ros__parameters:\n    clustering.dbscan.min_samples: 100000\n")
     no_clusters = scores(evaluate(tmp_path, "--data", bag, *many))
@@ -178,7 +178,7 @@ def test_probable_typos_in_a_parameter_file_are_reported(text, said, tmp_path, c
     assert said in capsys.readouterr().err
 
 
-def test_detector_settings_take_effect_and_precedence():
+def test_detector_settings_take_precedence_over_options():
     made = chosen(
         "--weights",
         "pointpillars",
@@ -196,7 +196,7 @@ def test_detector_settings_take_effect_and_precedence():
         DetectorChoice("f.json", settings={"fused.weights": "a"}).open()
 
 
-def test_named_pipe_as_parameter_file_is_rejected_at_once(tmp_path):
+def test_named_pipe_as_parameter_file_is_rejected(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="is not a regular file"):
         read_config(tmp_path / "pipe", PipelineParams())

@@ -107,7 +107,7 @@ def test_labels_equal_sklearn_on_degenerate_clouds(name, xyz, min_samples):
         assert_same(np.asarray(xyz, np.float32), eps, min_samples)
 
 
-def test_doubling_points_and_min_samples_keeps_the_clusters():
+def test_doubled_points_and_min_samples_keep_the_clusters():
     rng = np.random.default_rng(5)
     xyz = rng.uniform(-1, 1, (300, 3)).astype(np.float32)
     once = dbscan(xyz, 0.3, 5)
@@ -139,7 +139,7 @@ def banded_reference(xyz, params):
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 600), st.integers(1, 8))
-def test_distance_aware_equals_sklearn_in_each_band(seed, count, min_samples):
+def test_distance_aware_dbscan_equals_sklearn_in_each_band(seed, count, min_samples):
     rng = np.random.default_rng(seed)
     xyz = (rng.uniform(-6, 6, (count, 3)) * [1, 1, 0.2]).astype(np.float32)
     params = DbscanParams(range_limits=(2.0, 3.5, 5.0), eps=(0.2, 0.5, 0.3, 0.8), min_samples=min_samples)
@@ -147,7 +147,7 @@ def test_distance_aware_equals_sklearn_in_each_band(seed, count, min_samples):
 
 
 @pytest.mark.parametrize("limit, at", [(15.0, [15, 0]), (15.0, [0, -15]), (15.0, [9, 12]), (30.0, [-18, 24])])
-def test_a_point_at_a_range_limit_is_in_the_far_band(limit, at):
+def test_point_at_a_range_limit_is_in_the_far_band(limit, at):
     # Points 0.25 m apart form a cluster only beyond the limit, where eps is larger.
     at = np.array([*at, 0], np.float32)
     inner = at * np.float32(1 - 1e-6)
@@ -159,7 +159,7 @@ def test_a_point_at_a_range_limit_is_in_the_far_band(limit, at):
     assert distance_aware_dbscan(np.stack([inner, at + up]), params).tolist() == [0, 0]
 
 
-def test_a_cluster_across_a_range_limit_is_split():
+def test_cluster_across_a_range_limit_is_split():
     xyz = np.zeros((200, 3), np.float32)
     xyz[:, 0] = np.linspace(14, 16, 200)
     labels = distance_aware_dbscan(xyz, DbscanParams())
@@ -182,7 +182,7 @@ def slow_join(xyz, labels, params):
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 150))
-def test_join_bands_joins_touching_clusters_only(seed, count):
+def test_join_bands_joins_only_touching_clusters(seed, count):
     rng = np.random.default_rng(seed)
     xyz = (rng.uniform(-6, 6, (count, 3)) * [1, 1, 0.1]).astype(np.float32)
     cut = DbscanParams(range_limits=(2.0, 4.0), eps=(0.9, 0.7, 1.0), min_samples=3)
@@ -202,14 +202,14 @@ def test_join_bands_reunites_a_cluster_across_a_limit():
     assert distance_aware_dbscan(gap, JOIN).max() == 2
 
 
-def test_without_limits_distance_aware_is_plain_dbscan():
+def test_distance_aware_without_limits_is_plain_dbscan():
     xyz = np.random.default_rng(1).uniform(-20, 20, (2000, 3)).astype(np.float32)
     params = DbscanParams(range_limits=(), eps=(2.0,), min_samples=4)
     np.testing.assert_array_equal(distance_aware_dbscan(xyz, params), dbscan(xyz, 2.0, 4))
 
 
 @pytest.mark.parametrize("far", [[1e5, 0, 0], [0, -1e5, 0], [0, 0, 1e5], [-7e4, 7e4, -1e3]])
-def test_an_outlier_100_km_away_does_not_change_clusters(far):
+def test_outlier_100_km_away_does_not_change_clusters(far):
     xyz = np.random.default_rng(7).uniform(-2, 2, (800, 3)).astype(np.float32)
     labels = dbscan(xyz, 0.4, 5)
     for place in (0, 400, 800):
@@ -265,7 +265,7 @@ def test_min_samples_1_gives_the_connected_components():
     np.testing.assert_array_equal(labels, reference(xyz, 0.5, 1))
 
 
-def test_more_min_samples_than_points_is_all_noise():
+def test_min_samples_above_point_count_gives_only_noise():
     xyz = np.zeros((9, 3), np.float32)
     assert not dbscan(xyz, 1.0, 10).any()
     assert not dbscan(xyz, 1.0, 2**31 - 1).any()
@@ -305,7 +305,7 @@ def test_layout_and_dtype_of_the_input_do_not_matter():
     np.testing.assert_array_equal(xyz, before)
 
 
-def test_a_million_equal_points_are_one_cluster():
+def test_million_equal_points_are_one_cluster():
     # Neighbour lists would need 10^12 entries.
     assert (dbscan(np.full((1_000_000, 3), 1.7, np.float32), 0.15, 10) == 1).all()
 
@@ -337,7 +337,7 @@ def test_dbscan_by_growing_rejects_dense_points():
     assert dbscan_by_growing(np.zeros((100_000, 3), np.float32), 0.5, 10) is None
 
 
-def test_a_forked_process_can_cluster():
+def test_forked_process_can_cluster():
     """A forked process lacks its parent's thread pool for the bands."""
     xyz = np.random.default_rng(0).uniform(-40, 40, (500, 3)).astype(np.float32)
     labels = distance_aware_dbscan(xyz)

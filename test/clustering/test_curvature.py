@@ -33,7 +33,7 @@ def plain(xyz, radius, limit):
     return np.abs(variation - means) <= limit
 
 
-def test_consistent_points_equal_plain_numpy():
+def test_consistent_points_equal_numpy_reference():
     xyz = np.concatenate(wall_and_bush())[::10]
     radii = np.full(len(xyz), 0.5)
     result = find_consistent_points(xyz, radii, 0.02, MAX_WORK)

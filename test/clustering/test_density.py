@@ -93,7 +93,7 @@ def test_cropping_and_scaling_keep_the_density(scan):
     assert measure_density(xyz * np.float32(0.1)) == pytest.approx(measure_density(xyz), rel=1e-3)
 
 
-def test_unknown_or_full_density_keeps_the_parameters():
+def test_unknown_or_full_density_changes_no_parameters():
     lonely = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
     unusable = np.array([[0, 0, 0], [np.nan, 1, 1], [np.inf, 0, 0]], np.float32)
     for xyz in (np.zeros((0, 3), np.float32), lonely, unusable):
@@ -140,7 +140,7 @@ def test_points_with_different_radii_cluster_as_if_separate():
 
 
 @pytest.mark.parametrize("params", ADAPTIVE, ids=["PointNet", "experts", "people"])
-def test_clusters_of_an_hdl_64e_ignore_the_density(params, scan):
+def test_density_does_not_change_clusters_of_an_hdl_64e(params, scan):
     ground = np.isin(scan.semantic, (40, 44, 48, 49, 60, 72))
     result = cluster_obstacles(scan.frame.xyz, ground, params)
     assert result.max() > 20
@@ -155,7 +155,7 @@ def test_no_real_scan_of_an_hdl_64e_counts_as_sparse(layout):
 
 
 @pytest.mark.parametrize("params", ADAPTIVE[::2], ids=["PointNet", "people"])
-def test_objects_are_not_split_with_a_tenth_of_the_points(params, scan):
+def test_adaptation_keeps_objects_of_sparse_clouds_whole(params, scan):
     kept = np.random.default_rng(1).random(len(scan.frame)) < 0.1
     xyz = scan.frame.xyz[kept]
     ground = np.isin(scan.semantic[kept], (40, 44, 48, 49, 60, 72))

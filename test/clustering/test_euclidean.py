@@ -101,7 +101,7 @@ def test_lattice_clouds_equal_the_plain_implementation(data):
 
 
 @pytest.mark.parametrize("threshold", ["local", "global"])
-def test_a_real_scan_equals_the_plain_implementation(threshold, data):
+def test_real_scan_equals_the_plain_implementation(threshold, data):
     from lidar_perception.ground.params import GroundParams
     from lidar_perception.ground.segment import segment_ground
     from lidar_perception.types import PointCloud
@@ -126,7 +126,7 @@ def test_permuting_points_permutes_labels(params):
 
 
 @pytest.mark.parametrize("params", SETTINGS[:2], ids=SETTING_NAMES[:2])
-def test_moving_and_rotating_the_cloud_changes_nothing(params):
+def test_labels_do_not_depend_on_the_frame(params):
     """The clusters are so far apart that rounding does not matter."""
     xyz = blobs(3, [[0, 0, 0], [8, 0, 0], [0, 9, 1], [-7, -7, 0]])
     turn = np.array([[np.cos(0.7), -np.sin(0.7), 0], [np.sin(0.7), np.cos(0.7), 0], [0, 0, 1]])

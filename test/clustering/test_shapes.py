@@ -81,7 +81,7 @@ def assert_rotated(before, after, angle, atol):
 
 @each_shape
 @given(seeds)
-def test_a_box_is_the_smallest_that_holds_its_points(shape, seed):
+def test_box_is_the_smallest_around_its_points(shape, seed):
     xyz, labels = make_clusters(seed)
     boxes = fit_boxes(xyz, labels, shape)
     assert boxes.dtype == np.float32 and boxes.shape == (labels.max(), 7)
@@ -114,7 +114,7 @@ def test_axis_aligned_boxes_span_minimum_to_maximum(seed):
 
 
 @given(seeds, st.floats(0, 2 * np.pi))
-def test_min_area_has_the_least_area(seed, angle):
+def test_min_area_box_has_the_least_area(seed, angle):
     rng = np.random.default_rng(seed)
     xyz = rotate(rng.normal(size=(rng.integers(4, 300), 3)) * [3, 1, 1], rng.uniform(0, 4))
     xyz = (xyz + rng.uniform(-50, 50, 3)).astype(np.float32)
@@ -130,7 +130,7 @@ def test_min_area_has_the_least_area(seed, angle):
 
 
 @given(seeds, st.integers(3, 400), st.floats(0.5, 2000))
-def test_min_area_accepts_only_corner_points(seed, count, radius):
+def test_min_area_box_of_convex_points_has_the_least_area(seed, count, radius):
     angles = np.random.default_rng(seed).uniform(0, 2 * np.pi, count)
     xyz = np.column_stack([np.cos(angles), 0.7 * np.sin(angles), angles]) * radius
     xyz = xyz.astype(np.float32)
@@ -168,7 +168,7 @@ def test_l_shape_recovers_a_car_from_two_sides(seed, yaw):
     np.testing.assert_allclose(box[3:5], car[3:5], atol=0.1)
 
 
-def test_l_shape_finds_sides_that_min_area_misses():
+def test_l_shape_recovers_yaw_where_min_area_fails():
     # Two equally long sides form a triangle; its smallest rectangle is along the longest edge.
     side, rng = np.linspace(0, 1.6, 80), np.random.default_rng(0)
     flat = np.zeros((160, 3))
@@ -181,7 +181,7 @@ def test_l_shape_finds_sides_that_min_area_misses():
 
 @each_shape
 @given(seeds)
-def test_the_order_of_the_points_does_not_matter(shape, seed):
+def test_order_of_the_points_does_not_matter(shape, seed):
     xyz, labels = make_clusters(seed)
     order = np.random.default_rng(seed).permutation(len(xyz))
     np.testing.assert_array_equal(fit_boxes(xyz[order], labels[order], shape), fit_boxes(xyz, labels, shape))
@@ -221,7 +221,7 @@ def test_coincident_or_collinear_points_have_a_box(name, xyz, length, yaw):
 
 
 @each_shape
-def test_unused_cluster_ids_have_boxes_of_zeros(shape):
+def test_boxes_of_unused_cluster_ids_are_zero(shape):
     empty = np.zeros((0, 3), np.float32), np.zeros(0, np.int32)
     noise = np.ones((5, 3), np.float32), np.zeros(5, np.int32)
     for cloud in (empty, noise):
@@ -244,7 +244,7 @@ def test_layout_and_dtype_of_the_input_do_not_matter(shape):
 
 
 @given(seeds, st.floats(-np.pi / 2, np.pi / 2), st.floats(0.2, 0.8))
-def test_an_evenly_filled_ellipse_is_recovered(seed, yaw, ratio):
+def test_ellipse_of_uniform_points_is_recovered(seed, yaw, ratio):
     rng = np.random.default_rng(seed)
     radius, angle = np.sqrt(rng.uniform(0, 1, 20_000)), rng.uniform(0, 2 * np.pi, 20_000)
     axes = 3 * np.array([1, ratio])

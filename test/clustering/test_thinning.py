@@ -51,7 +51,7 @@ def test_points_slightly_farther_than_eps_are_separate_clusters(method):
 
 @each_method
 @pytest.mark.parametrize("seed", range(3))
-def test_thinning_connects_at_least_the_same_points_and_few_more(method, seed, always_thin):
+def test_thinning_extends_the_reach_within_its_tolerance(method, seed, always_thin):
     """Thinned clusters contain those of REACH and are contained in those of the longer reach."""
     rng = np.random.default_rng(seed)
     blobs = rng.uniform(-2.5, 2.5, (12, 3)) + [15, 0, 0]
@@ -65,7 +65,7 @@ def test_thinning_connects_at_least_the_same_points_and_few_more(method, seed, a
         assert len(pairs) == len(np.unique(finer))
 
 
-def test_one_point_represents_each_cube_and_kind():
+def test_thinned_points_represent_neighbours_of_their_kind():
     rng = np.random.default_rng(0)
     xyz, kind = rng.random((4000, 3)), rng.integers(0, 2, 4000)
     reach = rng.choice([0.3, 3.0], 4000)
@@ -78,7 +78,7 @@ def test_one_point_represents_each_cube_and_kind():
 
 
 @pytest.mark.parametrize("gap", [1e-3, 1e-5])
-def test_work_of_joining_cells_grows_linearly(gap, monkeypatch):
+def test_cost_of_joining_cells_is_linear(gap, monkeypatch):
     """Count distances, exact and thinned; comparing all pairs would take 16 times as many."""
     monkeypatch.setattr(thinning, "MIN_DISTANCES", 0)
     monkeypatch.setattr(thinning, "MAX_DISTANCES_PER_POINT", 50)

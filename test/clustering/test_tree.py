@@ -63,7 +63,7 @@ def draw_lattice(data):
 
 
 @given(st.data())
-def test_every_search_equals_brute_force(data):
+def test_tree_searches_equal_brute_force(data):
     tree = build_tree(draw_lattice(data))
     n = len(tree.points)
     rng = np.random.default_rng(data.draw(st.integers(0, 99)))
@@ -153,7 +153,7 @@ def count_work(xyz):
 
 
 @each_arrangement
-def test_work_of_the_tree_grows_as_n_log_n(arrange):
+def test_cost_of_the_tree_is_n_log_n(arrange):
     """Four times the points take less than six times the distances (n log n: 4.6)."""
     few, many = 4000, 16_000
     small, large = (count_work(make_points(arrange, count)) for count in (few, many))
@@ -163,7 +163,7 @@ def test_work_of_the_tree_grows_as_n_log_n(arrange):
 
 
 @each_arrangement
-def test_sampling_bounds_the_work_of_local_thresholds(arrange):
+def test_sampling_bounds_the_cost_of_local_thresholds(arrange):
     for count in (2000, 8000):
         cells = sort_into_cells(make_points(arrange, count), 0.5)
         sample = sample_cells(cells, 27 * 50 * count)  # at most 50 points per cell
@@ -187,7 +187,7 @@ def test_sampling_bounds_the_work_of_local_thresholds(arrange):
         for name in ("a cube", "equal", "a line", "a sphere", "two blobs out of reach", "a few indices")
     ],
 )
-def test_sampled_means_are_close_and_ignore_the_order(arrange):
+def test_sampled_means_are_accurate_in_any_order_of_points(arrange):
     xyz = make_points(arrange, 3000)
     cells = sort_into_cells(xyz, 0.5)
     exact, sampled = np.empty(3000), np.empty(3000)
@@ -206,7 +206,7 @@ def test_sampled_means_are_close_and_ignore_the_order(arrange):
     np.testing.assert_allclose(other, sampled, rtol=1e-9, atol=1e-12)
 
 
-def test_joining_a_dense_wall_at_a_limit_takes_little_work():
+def test_cost_of_joining_a_dense_wall_is_low():
     rng = np.random.default_rng(0)
     wall = np.column_stack(
         [rng.normal(15, 0.01, 4000), rng.uniform(-0.7, 0.7, 4000), rng.uniform(-1.7, 0.7, 4000)]

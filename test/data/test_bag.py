@@ -63,7 +63,7 @@ def test_clouds_are_stored_bit_by_bit(tmp_path):
     assert full.tobytes() == cloud.tobytes()
 
 
-def test_missing_parts_of_a_scan_are_not_written(tmp_path):
+def test_missing_labels_camera_and_pose_are_not_written(tmp_path):
     write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(scene(), STAMP))])
     recording = open_recording(tmp_path / "bag")
     (read,) = recording
@@ -239,7 +239,7 @@ def test_messages_without_chunks_are_read_one_by_one(written, tmp_path, monkeypa
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_files_of_a_split_bag_are_read_in_order_of_time(tmp_path, storage):
+def test_files_of_a_split_bag_are_read_in_time_order(tmp_path, storage):
     parts = []
     for name, stamps in (("late", (30, 40)), ("early", (10, 20))):
         with BagWriter(tmp_path / f"{name}_ours") as bag:

@@ -50,7 +50,7 @@ def test_force_replaces_only_bags(tmp_path, make):
 
 
 @pytest.mark.parametrize("force", [False, True])
-def test_exception_leaves_old_bag_and_readable_incomplete_one(tmp_path, force):
+def test_exception_keeps_old_bag_and_readable_partial_bag(tmp_path, force):
     path = tmp_path / "bag"
     if force:
         write_bag(path, scans(1))
@@ -208,7 +208,7 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
 @pytest.mark.no_cover
-def test_damaged_byte_is_reported_or_changes_nothing(written, tmp_path, damage):
+def test_damaged_byte_is_reported_or_harmless(written, tmp_path, damage):
     """The damage is in the data, in a chunk header, or in the index."""
     raw, before = (written / "drive.mcap").read_bytes(), message_bytes(written)
     path, reported = tmp_path / "drive.mcap", 0

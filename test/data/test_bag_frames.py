@@ -54,7 +54,7 @@ def find_scene(frame):
     return next(i for i in range(3) if same_cloud(scene(i), frame.load().xyz))
 
 
-def test_first_frame_needs_no_scan_of_the_bag(written, monkeypatch):
+def test_first_frame_is_read_without_scanning_the_bag(written, monkeypatch):
     """Scanning an hour of clouds takes minutes, and many commands need only the first one."""
     stamped = []
     monkeypatch.setattr(bag_frames.BagFrames, "_stamp", lambda self, data, time: stamped.append(time) or time)
@@ -63,7 +63,7 @@ def test_first_frame_needs_no_scan_of_the_bag(written, monkeypatch):
     assert frames[1].index == 1 and len({*stamped}) == 3
 
 
-def test_indexed_frame_is_read_when_it_is_loaded(written, tmp_path):
+def test_indexed_frame_is_read_on_load(written, tmp_path):
     shutil.copytree(written, tmp_path / "bag")
     frame = open_recording(tmp_path / "bag").frames[1]
     os.truncate(tmp_path / "bag/drive.mcap", 100)
@@ -71,7 +71,7 @@ def test_indexed_frame_is_read_when_it_is_loaded(written, tmp_path):
         frame.load()
 
 
-def test_has_lists_only_recorded_content(tmp_path):
+def test_contents_lists_only_recorded_content(tmp_path):
     write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(scene(), STAMP))])
     assert open_recording(tmp_path / "bag").contents == set()
 

@@ -57,7 +57,7 @@ def test_odometry_of_another_frame_is_transformed_to_the_sensor(tmp_path):
     check(recorded(tmp_path / "bag", moving(ODOMETRY, "imu"), mount(), mounting), invert_pose(imu) @ ON_BASE)
 
 
-def test_clouds_in_the_odometry_frame_do_not_move(tmp_path):
+def test_poses_of_clouds_in_the_odometry_frame_are_identity(tmp_path):
     still = recorded(
         tmp_path / "bag", moving(ODOMETRY), cloud=lambda stamp: make_cloud_message(np.ones((3, 4)), stamp, "odom")
     )
@@ -87,7 +87,7 @@ def test_sensor_that_rotates_on_the_robot_has_correct_poses(tmp_path):
         np.testing.assert_allclose(frame.pose(), base_at(stamp) @ on_base(stamp), atol=1e-4)
 
 
-def test_no_pose_is_guessed(tmp_path):
+def test_missing_or_ambiguous_poses_are_none(tmp_path):
     fixed = recorded(tmp_path / "fixed", mount())  # static transforms only
     assert POSES not in fixed.contents and [frame.pose() for frame in fixed] == [None] * CLOUDS
     two = recorded(tmp_path / "two", moving("/left"), moving("/right"))
@@ -136,7 +136,7 @@ def test_invalid_poses_are_skipped_and_counted(tmp_path):
     assert recording.frames.poses.invalid_count == 1
 
 
-def test_odometry_topic_is_the_usual_one_or_the_only_one():
+def test_odometry_topic_is_the_common_name_or_the_only_one():
     kind = ODOMETRY_MESSAGE
     assert choose_odometry_topic({"/b": kind, ODOMETRY: kind, FILTERED_ODOMETRY: kind}) == ODOMETRY
     assert choose_odometry_topic({"/b": kind, FILTERED_ODOMETRY: kind}) == FILTERED_ODOMETRY

@@ -156,7 +156,7 @@ def test_unreadable_topics_do_not_affect_others(written, rows, tmp_path):
             bag.require("/log")
 
 
-def test_topic_with_two_types_is_read_as_the_frequent_one(written, rows, tmp_path):
+def test_topic_with_two_types_is_read_as_the_more_frequent(written, rows, tmp_path):
     clouds = [row for row in rows if row[0] == POINTS]
     with open(tmp_path / "a.mcap", "wb") as stream:
         writer = Writer(stream)
@@ -269,7 +269,7 @@ def update_topics(info, **values):
         lambda info: update_topics(info, type_description_hash="RIHS01_0", serialization_format=""),
     ],
 )
-def test_irrelevant_metadata_changes_nothing(written, rows, tmp_path, change):
+def test_irrelevant_metadata_is_ignored(written, rows, tmp_path, change):
     path = copy_with_metadata(written, tmp_path / "bag", change)
     assert message_bytes(path) == rows
     assert len(open_recording(path)) == 3
@@ -328,7 +328,7 @@ def set_counts(info, count):
         (lambda info: info.clear(), "KeyError: 'relative_file_paths'"),
     ],
 )
-def test_wrong_metadata_causes_one_warning(written, rows, tmp_path, change, words):
+def test_wrong_metadata_is_reported_in_one_warning(written, rows, tmp_path, change, words):
     path = copy_with_metadata(written, tmp_path / "bag", change)
     with pytest.warns(InputWarning, match=f"bag/metadata.yaml does not match the bag: .*{words}") as caught:
         recording = open_recording(path)
@@ -398,7 +398,7 @@ def write_parts(folder, stamps):
 @pytest.mark.parametrize(
     "stamps", [([10, 20], [30, 40], [50]), ([50, 60], [30], [10, 20]), ([10, 30, 50], [20, 40], [30]), ([], [10], [])]
 )
-def test_files_of_a_drive_are_read_in_order_of_time(tmp_path, kind, stamps):
+def test_files_of_a_drive_are_read_in_time_order(tmp_path, kind, stamps):
     """Without metadata.yaml, as after a crash or from ROS 1; the files may overlap in time."""
     (tmp_path / "drive").mkdir()
     for i, part in enumerate(write_parts(tmp_path, stamps)):

@@ -41,7 +41,7 @@ def test_frames_have_ascending_stamps_and_unique_names(tmp_path, layout):
     assert stamps == sorted({*stamps}) and len({f.name for f in frames}) == len(frames)
 
 
-def test_object_and_tracking_frames_come_at_10_hz(tmp_path):
+def test_object_and_tracking_frames_are_stamped_at_10_hz(tmp_path):
     frames = open_recording(object_folder(tmp_path / "o", count=3))
     assert [f.stamp_ns - START_NS for f in frames] == [0, 10**8, 2 * 10**8]
     frames = open_recording(tracking_folder(tmp_path / "t")).frames

@@ -39,7 +39,7 @@ def read(frame):
     "file, content, words",
     [(file, content, words) for file, cases in INVALID_FILES.items() for content, words in cases],
 )
-def test_invalid_file_is_reported_for_its_frame_only(tmp_path, file, content, words):
+def test_invalid_file_affects_only_its_frame(tmp_path, file, content, words):
     root = object_folder(tmp_path)
     path = root / "training" / file
     path.unlink()

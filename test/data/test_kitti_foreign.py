@@ -92,7 +92,7 @@ def raw_scans(root, numbers, lines):
 
 
 @pytest.mark.parametrize("missing", [(3, 4, 5, 6), (0,), (0, 1, 8), (2, 5)])
-def test_blank_time_stamps_belong_to_missing_scans(tmp_path, missing):
+def test_blank_time_stamps_are_those_of_missing_scans(tmp_path, missing):
     numbers = [i for i in range(9) if i not in missing]
     blank = ["" if i in missing else line for i, line in enumerate(STAMPS)]
     for lines in (blank, STAMPS, [line for line in blank if line]):
@@ -129,7 +129,7 @@ def write_exported_drive(root, names=("0000000000", "0000000001", "0000000002"),
         (("a", "b", "c"), "# made by a tool\n2 a\n1 sub/c\n\n0 b\n", [0, 1, 2]),
     ],
 )
-def test_exported_drive_with_pcd_scans_has_labels(tmp_path, names, frame_list, indices):
+def test_drive_exported_with_pcd_scans_has_labels(tmp_path, names, frame_list, indices):
     recording = open_recording(write_exported_drive(tmp_path, names, frame_list))
     assert str(recording).endswith("KITTI raw drives, 3 frames, labelled boxes")
     assert not recording.has_times and [frame.index for frame in recording] == indices

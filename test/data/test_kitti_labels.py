@@ -40,7 +40,7 @@ def label_lines(draw) -> str:
 
 
 @given(st.lists(label_lines(), max_size=6))
-def test_labels_survive_conversion_to_truth_and_markers(lines):
+def test_labels_survive_conversion_to_markers_and_back(lines):
     truth = to_ground_truth([parse_label(line) for line in lines], LIDAR_TO_CAMERA)
     received = through_markers(truth)
     assert same(received, truth)
@@ -49,7 +49,7 @@ def test_labels_survive_conversion_to_truth_and_markers(lines):
 
 
 @given(label_lines().filter(lambda line: not line.startswith(("DontCare", "Unicorn"))))
-def test_label_can_be_computed_from_its_box(line):
+def test_computed_label_matches_its_box(line):
     label = parse_label(line)
     truth = to_ground_truth([label], LIDAR_TO_CAMERA)
     (again,) = to_labels(GroundTruth.of(truth.boxes, truth.class_ids), LIDAR_TO_CAMERA)
@@ -63,7 +63,7 @@ def test_label_can_be_computed_from_its_box(line):
 
 
 @given(label_lines().filter(lambda line: not line.startswith("DontCare")))
-def test_box_corners_are_those_of_the_development_kit(line):
+def test_box_corners_match_the_development_kit(line):
     """Compare with computeBox3D.m, for a level camera."""
     label = parse_label(line)
     level = np.eye(4)

@@ -20,7 +20,7 @@ def stamps(recording):
 # KITTI odometry
 
 
-def test_odometry_has_recorded_times_and_lidar_poses(tmp_path):
+def test_kitti_odometry_has_recorded_times_and_lidar_poses(tmp_path):
     recording = open_recording(odometry_folder(tmp_path))
     assert recording.has_times and stamps(recording) == [
         START_NS,
@@ -32,7 +32,7 @@ def test_odometry_has_recorded_times_and_lidar_poses(tmp_path):
         np.testing.assert_allclose(frame.calibration().lidar_to_camera, CALIBRATION.lidar_to_camera, atol=1e-9)
 
 
-def test_odometry_can_be_opened_with_any_of_its_files(tmp_path):
+def test_kitti_odometry_opens_from_any_of_its_files(tmp_path):
     root = odometry_folder(tmp_path) / "dataset"
     for sequence in ("00", "11"):
         (root / f"sequences/{sequence}/times.txt").unlink()
@@ -48,7 +48,7 @@ def test_odometry_can_be_opened_with_any_of_its_files(tmp_path):
         open_recording(tmp_path)
 
 
-def test_times_since_1970_are_stamps(tmp_path):
+def test_unix_times_are_kept_as_stamps(tmp_path):
     path = odometry_folder(tmp_path) / "dataset/sequences/00/times.txt"
     write(path, b"\xef\xbb\xbf1700000000.123456789\r\n1700000000.223456789\r\n")
     assert stamps(open_recording(tmp_path))[:2] == [1_700_000_000_123_456_789, 1_700_000_000_223_456_789]

@@ -26,14 +26,14 @@ def test_sensor_height_is_measured(height):
     assert abs(measure_sensor_height(xyz * np.float32([1, -1, -1])) + height) < 0.03
 
 
-def test_dense_vehicle_does_not_outweigh_the_ground():
+def test_dense_vehicle_is_not_taken_for_the_ground():
     xyz, _ = street(5, slope=(0.0, 0.03))
     roof = np.random.default_rng(0).uniform((-3, 2.6, -0.35), (3, 4.4, -0.3), (10 * len(xyz), 3)).astype(np.float32)
     assert abs(measure_sensor_height(np.concatenate([xyz, roof])) - 1.73) < 0.05
 
 
 @pytest.mark.parametrize("lean", [0, 3, 8, -20])
-def test_leaning_sensor_of_a_recording_is_reported(lean):
+def test_tilted_sensor_of_a_recording_is_reported(lean):
     pose = SensorPoseParams(pitch=np.radians(lean))
     clouds = [PointCloud.of(level_points(street(i)[0], pose)) for i in range(3)]
     recording = Recording(Path("drive.bag"), "bag", [])
@@ -47,7 +47,7 @@ def test_leaning_sensor_of_a_recording_is_reported(lean):
     assert find_mount_problem(recording, []) is None
 
 
-def test_table_above_the_sensor_is_not_the_floor():
+def test_table_above_the_sensor_is_not_taken_for_the_floor():
     rng = np.random.default_rng(0)
     table = rng.uniform((-6, -6, 0.28), (6, 6, 0.32), (3000, 3))
     room = rng.uniform((-9, -9, 0.4), (9, 9, 2.2), (3000, 3))
@@ -55,13 +55,13 @@ def test_table_above_the_sensor_is_not_the_floor():
     assert measure_sensor_height(np.concatenate([table, room]).astype(np.float32)) is None
 
 
-def test_height_problems_name_the_remedy():
+def test_wrong_height_is_reported_with_remedy():
     assert "set it to 0.60" in find_height_problem(0.6, SensorPoseParams())
     assert "upside down" in find_height_problem(-1.7, SensorPoseParams())
     assert find_height_problem(None, SensorPoseParams()) is None
 
 
-def test_no_height_is_measured_without_a_plane():
+def test_height_is_unknown_without_a_plane():
     wall = np.random.default_rng(0).uniform(-9, 9, (5000, 3)) * [0, 1, 1] + [9, 0, 0]
     for xyz in (np.zeros((0, 3)), np.ones((1, 3)), wall, np.full((100, 3), 9.0)):
         assert measure_sensor_height(xyz.astype(np.float32)) is None

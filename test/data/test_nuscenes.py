@@ -73,7 +73,7 @@ def test_key_frames_are_ordered_by_scene_and_time(root):
     assert {f.sensor_height for f in frames} == {folder.SENSOR[2]}
 
 
-def test_points_inside_a_box_are_inside_it_when_read(root):
+def test_points_of_an_object_are_inside_its_box(root):
     boxes = 0
     for frame in open_nuscenes(root):
         scan, truth, rows = frame.load(), frame.truth(), find_labels(frame)
@@ -112,7 +112,7 @@ def test_sensor_axes_are_rotated_to_those_of_the_vehicle(changed):
     assert read_records(frame.points, SWEEP_COLUMNS).shape == (6, 5) and scan.stamp_ns == frame.stamp_ns
 
 
-def test_returns_of_the_vehicle_itself_are_dropped(root):
+def test_ego_vehicle_returns_are_dropped(root):
     frame = open_nuscenes(root)[0]
     cloud, scan = read_records(frame.points, SWEEP_COLUMNS), frame.load()
     own = (np.abs(cloud[:, :2]) < EGO_RADIUS_M).all(axis=1)
@@ -199,7 +199,7 @@ def test_labels_have_names_and_attributes(root):
     assert set(CATEGORIES.values()) == set(NAMES) and len(ATTRIBUTES) == 8
 
 
-def test_order_of_rows_does_not_matter(root, changed):
+def test_order_of_table_rows_does_not_matter(root, changed):
     def shuffle(tables):
         rng = np.random.default_rng(5)
         for name, rows in tables.items():
@@ -217,7 +217,7 @@ def test_tables_can_be_read_in_chunks_of_any_size(root, monkeypatch, chunk):
     assert same_frames(open_nuscenes(root), whole)
 
 
-def test_table_may_be_on_one_line_or_empty(tmp_path):
+def test_single_line_and_empty_tables_are_read(tmp_path):
     (tmp_path / "v").mkdir()
     for text, rows in ('[{"a":1,"b":"x, ] y"},{"b":2,"a":0}]', [(1, "x, ] y"), (0, 2)]), (" [ ] \n", []):
         (tmp_path / "v/t.json").write_text(text)
@@ -309,7 +309,7 @@ def test_damaged_tables_are_reported(changed, damage):
     assert "\n" not in str(caught.value)
 
 
-def test_damage_in_a_large_table_is_found_early(changed, monkeypatch):
+def test_damaged_large_table_is_not_read_to_the_end(changed, monkeypatch):
     root = changed()
     path = root / folder.VERSION / "ego_pose.json"
     text = json.dumps(TABLES["ego_pose"] * 50).replace("{", "{?", 1)

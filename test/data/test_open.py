@@ -72,7 +72,7 @@ def test_semantickitti_sequence_is_a_recording(tmp_path):
     assert len(open_recording(root)) == 3
 
 
-def test_cloud_files_have_order_and_times_of_their_names(tmp_path):
+def test_cloud_files_are_ordered_and_stamped_by_name(tmp_path):
     folder = cloud_folder(tmp_path / "counted")
     assert [f.name for f in open_recording(folder)] == ["scan1", "scan2", "scan10"]
     assert [f.name for f in open_recording(folder / "scan10.bin")] == ["scan10"]
@@ -92,7 +92,7 @@ def test_cloud_files_have_order_and_times_of_their_names(tmp_path):
         assert "no times" in str(open_recording(timed))
 
 
-def test_cloud_topic_of_a_bag_is_found_or_chosen(tmp_path):
+def test_cloud_topic_of_a_bag_is_inferred_or_given(tmp_path):
     def write_clouds(name, *topics):
         with BagWriter(tmp_path / name) as writer:
             for topic in topics:
@@ -122,7 +122,7 @@ def test_cloud_topic_of_a_bag_is_found_or_chosen(tmp_path):
 
 
 @pytest.mark.parametrize("height, expected", [(0.6, 0.6), (1.8, SENSOR_HEIGHT)])
-def test_commands_measure_an_unknown_sensor_height(tmp_path, height, expected):
+def test_commands_measure_the_sensor_height_if_unknown(tmp_path, height, expected):
     rng = np.random.default_rng(0)
     ground = rng.uniform([-20, -20, -0.02], [20, 20, 0.02], (9000, 3)) - [0, 0, height]
     cloud = np.column_stack([ground, np.ones(len(ground))]).astype(np.float32)
@@ -175,7 +175,7 @@ def test_labels_without_scan_are_listed(tmp_path):
 
 
 @each_recording
-def test_split_selects_frames_in_its_order_once(tmp_path, kind):
+def test_split_selects_each_frame_once_in_its_order(tmp_path, kind):
     root = MADE[kind][0](tmp_path / kind)
     names = [frame.name for frame in open_recording(root)]
     requested = [names[-1], names[0], names[-1]]
@@ -192,7 +192,7 @@ def test_split_selects_frames_in_its_order_once(tmp_path, kind):
     "kind, sequences",
     [("tracking", ("0007", "0000")), ("nuscenes", nuscenes_folder.SCENES[::-1]), ("semantickitti", ("08", "00"))],
 )
-def test_split_may_name_sequences(tmp_path, kind, sequences):
+def test_split_accepts_names_of_sequences(tmp_path, kind, sequences):
     root = MADE[kind][0](tmp_path / kind)
     frames = list(open_recording(root))
     first, second = ([f.name for f in frames if f.sequence == name] for name in sequences)
@@ -245,7 +245,7 @@ def test_unusable_returns_are_dropped_from_all_columns(tmp_path):
     assert np.array_equal(read.point_truth().instances, kept)
 
 
-def test_semantickitti_poses_are_those_written(tmp_path):
+def test_semantickitti_poses_are_read_unchanged(tmp_path):
     frames = open_recording(semantic_folder(tmp_path)).frames
     for frame in frames:
         np.testing.assert_allclose(frame.pose(), drive(int(frame.points.stem)), atol=1e-9)
@@ -263,7 +263,7 @@ def test_semantickitti_poses_are_those_written(tmp_path):
         open_recording(tmp_path).frames[-1].pose()
 
 
-def test_named_pipe_is_rejected_without_waiting(tmp_path):
+def test_named_pipe_is_rejected_without_blocking(tmp_path):
     (tmp_path / "bag").mkdir()
     for path in ("bag/bag.mcap", "pipe.bin"):
         os.mkfifo(tmp_path / path)

@@ -226,7 +226,7 @@ def test_bag_with_several_sensors_needs_a_topic(tmp_path):
         open_clouds(tmp_path / "three", "/other")
 
 
-def test_times_in_file_names_are_stamps(tmp_path):
+def test_times_in_file_names_are_read_as_stamps(tmp_path):
     for name in ("1700000000.1", "1700000000.2"):
         (tmp_path / f"{name}.pcd").write_bytes(pcd(points(), "ascii"))
     clouds = open_clouds(tmp_path)
@@ -243,7 +243,7 @@ def test_times_in_file_names_are_stamps(tmp_path):
         (["0000000000", "0000000001", "0000000010"], False),
     ],
 )  # KITTI's frame numbers
-def test_files_are_in_order_of_time_or_number(names, timed, tmp_path):
+def test_files_are_ordered_by_time_or_number(names, timed, tmp_path):
     for name in reversed(names):
         (tmp_path / f"{name}.pcd").write_bytes(pcd(points(), "ascii"))
     recording = open_recording(tmp_path)
@@ -253,7 +253,7 @@ def test_files_are_in_order_of_time_or_number(names, timed, tmp_path):
     assert timed == (stamps[-1] == 1_700_000_001 * 10**9)
 
 
-def test_clouds_are_chosen_in_evenly_spread_pairs():
+def test_evenly_spaced_pairs_of_clouds_are_chosen():
     assert choose_clouds(5, 10) == [0, 1, 2, 3, 4]
     chosen = choose_clouds(1000, 40)
     assert len(chosen) == 40 and chosen[:2] == [0, 1] and chosen[-1] == 999

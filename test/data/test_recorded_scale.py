@@ -93,7 +93,7 @@ LAYOUTS = {
 @pytest.mark.parametrize(
     "full, whole", [(1, False), (100, False), (255, False), (255, True), (1023, True), (65535, True)]
 )
-def test_scale_is_the_same_for_all_frames_in_any_order(tmp_path, layout, full, whole):
+def test_scale_does_not_depend_on_order_of_frames(tmp_path, layout, full, whole):
     LAYOUTS[layout](tmp_path, clouds(full, whole))
     path = tmp_path / "drive" if layout == "bag" else tmp_path
     expected = [cloud[:, 3] / np.float32(full) for _, cloud in clouds(full, whole)]
@@ -159,7 +159,7 @@ def test_invalid_cloud_does_not_affect_the_scale(tmp_path):
     assert frames[0].load().intensity.max() == np.float32(1.2) / np.float32(255)
 
 
-def test_commands_report_the_scale_and_export_0_to_1(tmp_path, monkeypatch, capfd):
+def test_commands_report_the_scale_and_export_unit_intensity(tmp_path, monkeypatch, capfd):
     object_files(tmp_path / "own", clouds(255))
     assert exit_of(monkeypatch, "convert", tmp_path / "own", "--out", tmp_path / "own.bag") == 0
     assert "intensity 0 .. 255, read as 0 .. 1" in capfd.readouterr().err

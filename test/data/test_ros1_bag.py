@@ -34,7 +34,7 @@ def test_ros1_bag_equals_the_ros2_bag(drive_bag, tmp_path, compress):
     np.testing.assert_array_equal(by_number.load(len(ours) - 1).data, open_clouds(drive_bag).load(len(ours) - 1).data)
 
 
-def test_folder_named_bag_is_a_ros2_bag(drive_bag, tmp_path):
+def test_folder_with_bag_suffix_is_a_ros2_bag(drive_bag, tmp_path):
     shutil.copytree(drive_bag, tmp_path / "drive.bag")
     assert "rosbag2 bag" in str(open_recording(tmp_path / "drive.bag"))
 
@@ -44,7 +44,7 @@ def test_poses_come_from_odometry_and_tf(tmp_path):
     check(open_recording(as_ros1(tmp_path / "robot", tmp_path / "robot.bag", "bz2")))
 
 
-def test_old_tf_name_latched_topics_and_unknown_types_are_read(tmp_path):
+def test_ros1_tf_latched_topics_and_unknown_types_are_read(tmp_path):
     store = get_typestore(Stores.ROS1_NOETIC)
     for kind in ("tf/msg/tfMessage", "tf2_msgs/msg/TFMessage", "driver_msgs/msg/Packet"):
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))

@@ -246,7 +246,7 @@ def test_written_tracks_score_like_the_tracker(drives, tmp_path, monkeypatch):
     assert collect_numbers(scores[0]) == pytest.approx(collect_numbers(scores[1]), abs=1e-3)
 
 
-def test_drives_of_a_bag_are_tracked_separately(tmp_path, monkeypatch):
+def test_each_drive_of_a_bag_is_tracked_separately(tmp_path, monkeypatch):
     """Drives of a bag have no names, so their files are numbered."""
     stamps = [STAMP + s * 10**8 for s in (0, 1, 100, 101)]
     write_bag(tmp_path / "bag", [Frame.of(str(i), cloud_frame(scene(i), stamp)) for i, stamp in enumerate(stamps)])
@@ -283,7 +283,7 @@ def test_stopped_run_is_resumed(drives, tmp_path, made):
     assert read_json(tmp_path / "parts") == read_json(tmp_path / "whole")
 
 
-def test_the_number_of_processes_does_not_change_the_result(drives, tmp_path):
+def test_number_of_processes_does_not_change_the_result(drives, tmp_path):
     recording = open_recording(drives)
     for name, jobs in ("one", 1), ("two", 2):
         run_detector(
@@ -311,7 +311,7 @@ def test_folder_of_another_run_needs_force(kitti, tmp_path, monkeypatch, capsys,
 # Invalid options
 
 
-def test_unreadable_frames_are_reported_and_others_written(kitti, tmp_path, monkeypatch, capsys, made):
+def test_unreadable_frames_are_reported_and_skipped(kitti, tmp_path, monkeypatch, capsys, made):
     scan_path, out = kitti / "training/velodyne/000001.bin", tmp_path / "out"
     content_bytes = scan_path.read_bytes()
     write(scan_path, b"123")
@@ -340,7 +340,7 @@ def test_unreadable_labels_and_cameras_are_optional(kitti, tmp_path, monkeypatch
     assert len(read_json(tmp_path / "out")["frames"]) == 4
 
 
-def test_equal_problems_are_reported_once_with_count(kitti, tmp_path, monkeypatch, capsys):
+def test_repeated_problem_is_reported_once_with_count(kitti, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
         MadeDetector,
         "__call__",

@@ -70,7 +70,7 @@ def test_clear_cars_are_found_behind_and_at_the_sides(street):
     assert len(match_centres(detected_cars[:, :3], cars[:, :3], 1.0)[0]) >= 0.8 * len(cars)
 
 
-def test_around_equals_single_pass_away_from_border(street):
+def test_range_around_equals_single_pass_away_from_border(street):
     detector, columns = open_shipped(), compute_columns(street.frame)
     half_header = replace(detector.proposer.header, config=replace(detector.proposer.config, **HALF))
     single_pass = make_detector(detector.proposer.network, half_header, detector.params)
@@ -95,7 +95,7 @@ def test_range_can_be_changed_and_restored(street):
     assert around_detector.with_range("around") is around_detector and len(around_detector.proposer.half_turns) == 1
 
 
-def test_around_accepts_empty_half_and_empty_cloud(street):
+def test_range_around_accepts_empty_half_and_empty_cloud(street):
     detector = open_shipped(range="around")
     ahead_result = detector(street.frame.take(np.flatnonzero(street.frame.xyz[:, 0] > 6)))
     assert len(ahead_result.detections) and ahead_result.problem is None

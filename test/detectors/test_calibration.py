@@ -45,7 +45,7 @@ def test_calibration_keeps_order_and_is_invertible(scores, slope, offset):
 @pytest.mark.parametrize(
     "make", [lambda: random_detector("v4", eager(score=0.0)), random_pointnet], ids=["PointPillars", "PointNet"]
 )
-def test_calibrated_detector_finds_same_boxes(make):
+def test_calibration_does_not_change_the_boxes(make):
     detector, scan = make().with_min_score(0.0), frame()
     raw_detections = detector(scan).detections
     (network,) = detector.networks
@@ -76,7 +76,7 @@ def test_calibrated_detector_finds_same_boxes(make):
         {"Car": ["a", 0]},
     ],
 )
-def test_calibration_that_does_not_rise_is_rejected(tmp_path, calibration):
+def test_invalid_calibration_is_rejected(tmp_path, calibration):
     header = Header(tiny("v0"), calibration=calibration)
     save_checkpoint(tmp_path / "w.safetensors", lively(tiny("v0")), header)
     with pytest.raises(InputError, match="invalid calibration"):
@@ -84,7 +84,7 @@ def test_calibration_that_does_not_rise_is_rejected(tmp_path, calibration):
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_save_header_keeps_stored_weights(tmp_path, half):
+def test_save_header_does_not_change_the_weights(tmp_path, half):
     path, config = tmp_path / "some.safetensors", tiny()
     save_checkpoint(path, lively(config), Header(config, calibration=LINES), half)
     _, original = read_checkpoint(path, type(config))

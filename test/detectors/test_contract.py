@@ -69,7 +69,7 @@ def test_detector_has_classes_and_thresholds(detectors, name):
 
 
 @each_name
-def test_array_gives_the_detections_of_its_frame(detectors, frame, name):
+def test_array_and_frame_give_equal_detections(detectors, frame, name):
     """Columns have a value for every row, including unusable points."""
     scan, detector = frame.load(), detectors[name]
     cloud, ground = scan.points(), scan.xyz[:, 2] < -1.5
@@ -124,7 +124,7 @@ def test_ego_vehicle_is_dropped_for_any_heading(seed):
     "pose",
     [SensorPoseParams(), SensorPoseParams(height=2.4), SensorPoseParams(roll=np.pi), SensorPoseParams(height=6.0)],
 )
-def test_ego_vehicle_is_dropped_and_next_car_is_kept(pose):
+def test_ego_vehicle_is_dropped_and_nearest_car_is_kept(pose):
     """The roof is detected in three parts, as in KITTI, for sensors up to MAX_MAST_M above the car."""
     offset = pose.height - SENSOR_HEIGHT
     roof = np.array(
@@ -149,7 +149,7 @@ def test_every_network_drops_the_ego_vehicle(detectors, frame, monkeypatch):
 
 
 @each_name
-def test_second_call_is_equal_and_frame_unchanged(detectors, frame, name):
+def test_second_call_gives_equal_result_for_unchanged_frame(detectors, frame, name):
     scan = frame.load()
     original = scan.xyz.copy(), scan.intensity.copy()
     result, second_result = (detectors[name](scan) for _ in range(2))

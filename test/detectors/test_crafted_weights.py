@@ -113,7 +113,7 @@ SMALL = {
 
 
 @pytest.mark.parametrize("network_name", SMALL)
-def test_mutated_header_is_used_or_rejected_in_one_line(network_name, tmp_path):
+def test_mutated_header_is_accepted_or_rejected_in_one_line(network_name, tmp_path):
     """Accepted headers match the shapes of the tensors, so the size of the file bounds the memory."""
     make_header, make, load, params = SMALL[network_name]
     header = make_header()

@@ -53,7 +53,7 @@ def module(tmp_path, monkeypatch):
     return name
 
 
-def test_class_gets_sensor_height_and_device(module):
+def test_own_detector_receives_sensor_height_and_device(module):
     detector = open_detector(f"{module}:Fixed", "cpu", sensor_height=0.5)
     assert detector.classes == ("Pedestrian", "Car")
     result = detector(scene(0))
@@ -64,7 +64,7 @@ def test_class_gets_sensor_height_and_device(module):
     assert detector.build(0.5).device == "cpu" and detector.build(0.5) is detector.build(0.5)
 
 
-def test_scores_below_threshold_are_dropped(module):
+def test_detections_below_the_threshold_are_dropped(module):
     detector = open_detector(f"{module}:Fixed")
     assert len(detector(scene(0)).detections) == 2 and detector.min_scores["Car"] == 0.0
     assert len(detector.with_min_score(0.5)(scene(0)).detections) == 1
@@ -72,7 +72,7 @@ def test_scores_below_threshold_are_dropped(module):
     assert strict_detector(scene(0)).detections.class_ids.tolist() == [0]
 
 
-def test_detector_gets_usable_cropped_points(module):
+def test_own_detector_receives_cropped_finite_points(module):
     cloud = scene(0)
     cloud[:5] = np.nan
     point_count = open_detector(f"{module}:Fixed")(cloud).detections.boxes[1, 5]
@@ -93,7 +93,7 @@ def test_detector_gets_usable_cropped_points(module):
         ("{}_absent:Fixed", "no module named"),
     ],
 )
-def test_unusable_class_is_rejected_in_one_line(module, reference, message):
+def test_unsuitable_class_is_rejected_in_one_line(module, reference, message):
     with pytest.raises(InputError, match=message) as error:
         open_detector(reference.format(module))
     assert "\n" not in str(error.value)
@@ -104,7 +104,7 @@ def test_range_is_rejected_if_the_class_has_no_such_argument(module):
         open_detector(f"{module}:Fixed", range="around")
 
 
-def test_wrong_return_type_ends_the_run(module):
+def test_wrong_return_type_of_own_detector_ends_the_run(module):
     with pytest.raises(RunError, match="returned ndarray instead of Detections"):
         open_detector(f"{module}:Returns")(scene(0))
 

@@ -51,13 +51,13 @@ def make_map(config, seed=0) -> torch.Tensor | None:
 
 @each_version
 @pytest.mark.parametrize("size", SIZES)
-def test_a_config_survives_json(version, size):
+def test_config_survives_json(version, size):
     config = make_config(version, size, classes=("Cyclist", "Car"))
     assert parse_config(NetworkConfig, dataclasses.asdict(config), "") == config
     assert config.classes == ("Cyclist", "Car") and config.grid == (496, 432)
 
 
-def test_versions_are_those_of_the_paper():
+def test_versions_match_the_paper():
     switches = {v: [s[k] for k in ("remove_ground", "cluster_ids", "pseudo_map", "neck")] for v, s in VERSIONS.items()}
     assert switches == {
         "v0": [False, False, False, "deconv"],
@@ -137,7 +137,7 @@ def test_keep_first_per_cell_equals_a_loop(seed, max_count):
     assert keep_first_per_cell(cells, max_count).tolist() == indices
 
 
-def test_the_order_of_the_points_makes_no_difference():
+def test_order_of_the_points_does_not_matter():
     config = tiny("v0")
     network, points = lively(config), make_points(config)
     image = network.pillar_net(make_pillar_batch([points], config))
@@ -181,7 +181,7 @@ def test_shift_by_one_pillar_shifts_image_by_one_cell():
         torch.testing.assert_close(shifted_image, image.roll((rows, columns), (2, 3)), atol=1e-5, rtol=0)
 
 
-def test_smaller_x_and_y_need_larger_weights():
+def test_scaled_x_and_y_equal_scaled_weights():
     config = tiny("v2", xy_scale=1.0)
     network, scaled_network = lively(config), lively(dataclasses.replace(config, xy_scale=0.125))
     scaled_network.load_state_dict(network.state_dict())
@@ -192,7 +192,7 @@ def test_smaller_x_and_y_need_larger_weights():
 
 
 @pytest.mark.parametrize("middle_z", [False, True])
-def test_limited_number_of_pillars_equals_padding(middle_z):
+def test_removing_padding_pillars_keeps_the_result(middle_z):
     config = tiny("v0", max_points=2, zero_row=True, middle_z=middle_z, xy_scale=1.0)
     network, points = lively(config), make_points(config, 900)
     net, low = network.pillar_net, torch.tensor(config.low)
@@ -245,7 +245,7 @@ def test_batch_of_two_equals_two_single_clouds(version):
 
 
 @each_version
-def test_folding_the_norms_changes_nothing(version):
+def test_folded_norms_give_equal_outputs(version):
     config = tiny(version)
     network = lively(config)
     pillars, cluster_map = make_pillar_batch([make_points(config)], config), make_map(config)
@@ -255,7 +255,7 @@ def test_folding_the_norms_changes_nothing(version):
     assert not [m for m in folded.modules() if isinstance(m, torch.nn.BatchNorm2d)]
 
 
-def test_boxes_at_some_anchors_equal_those_at_all():
+def test_boxes_of_selected_anchors_equal_those_of_all():
     config = tiny("v1")
     network = lively(config)
     features = network.compute_features(make_pillar_batch([make_points(config)], config))
@@ -266,7 +266,7 @@ def test_boxes_at_some_anchors_equal_those_at_all():
     assert torch.equal(network.head.compute_logits(features), outputs.logits)
 
 
-def test_a_tiny_network_learns_two_objects():
+def test_tiny_network_learns_two_objects():
     config = tiny("v0", block_channels=(16, 24, 24), deconv_channels=16, pillar_channels=16)
     torch.manual_seed(0)
     network = make_network(config)
@@ -309,7 +309,7 @@ def test_a_tiny_network_learns_two_objects():
 
 
 @pytest.mark.parametrize("changes", [{}, dict(version="v2"), dict(max_points=3, middle_z=True)])
-def test_pillars_of_one_cloud_equal_those_of_several(changes):
+def test_pillars_of_single_and_batched_clouds_are_equal(changes):
     config = tiny(**changes)
     rng = np.random.default_rng(0)
     low, high = np.array(config.low), np.array(config.high)

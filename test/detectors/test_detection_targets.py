@@ -119,7 +119,7 @@ def test_targets_equal_a_plain_implementation():
 
 
 @given(seeds)
-def test_distant_anchors_overlap_nothing(seed):
+def test_distant_anchors_have_no_overlap(seed):
     config = tiny()
     anchors, anchor_classes = anchor_tensors(config)
     boxes = torch.from_numpy(make_boxes(seed, 6, 12.0)).float()
@@ -154,7 +154,7 @@ def test_every_object_has_an_anchor_in_any_order():
         assert is_match.any() and (targets.labels[0, is_positive][is_match] == label).all()
 
 
-def test_no_valid_objects_give_background_only():
+def test_targets_without_valid_objects_are_background():
     config = tiny("v0")
     invalid_boxes = BOXES.clone()
     invalid_boxes[0, 3], invalid_boxes[1, 0] = 0, torch.nan
@@ -205,7 +205,7 @@ def make_batch(clouds: list[Targets]) -> Targets:
     return to_dense([to_sparse(cloud) for cloud in clouds], clouds[0].labels.shape[1], torch.device("cpu"))
 
 
-def test_sparse_targets_round_trip():
+def test_sparse_targets_survive_conversion_to_dense():
     config = tiny("v0")
     anchors = anchor_tensors(config)[0]
     clouds = [assign_targets(anchors, config, BOXES[:n], LABELS[:n]) for n in (2, 0, 1)]
@@ -214,7 +214,7 @@ def test_sparse_targets_round_trip():
         assert torch.equal(dense, torch.cat(single_clouds))
 
 
-def test_loss_of_doubled_batch_is_equal():
+def test_doubling_the_batch_keeps_the_loss():
     config = tiny("v0")
     anchors, anchor_classes = anchor_tensors(config)
     targets, outputs = assign_targets(anchors, config, BOXES, LABELS), make_random_outputs(anchors)
@@ -265,7 +265,7 @@ def compute_reference_iou(a, b):
 
 
 @given(seeds, st.booleans())
-def test_suppression_equals_a_slow_loop(seed, across):
+def test_nms_equals_a_plain_loop(seed, across):
     rng = np.random.default_rng(seed)
     boxes = make_boxes(seed, 30, spread=4)
     scores, labels, limit = rng.permutation(30) / 30, rng.integers(0, 3, 30), 0.2

@@ -31,7 +31,7 @@ each_version = pytest.mark.parametrize("version", VERSIONS)
 # view
 
 
-def test_view_selects_points_from_low_to_below_high():
+def test_view_includes_low_and_excludes_high():
     rng = np.random.default_rng(0)
     xyz = rng.integers(-3, 4, (500, 3)).astype(np.float32)  # many points are on the limits
     xyz[::7, rng.integers(3)] = np.nan
@@ -124,7 +124,7 @@ def test_cluster_map_equals_a_plain_loop_over_cells():
     assert image.shape == (3, 64, 64) and all(layer.any() for layer in image)
 
 
-def test_collinear_cluster_is_drawn_at_its_centre():
+def test_cluster_of_collinear_points_is_drawn_at_its_centre():
     config = tiny("v4")
     xyz = np.float32([[4.1, 1.1, -1], [4.5, 1.1, -0.5], [4.9, 1.1, 0]])
     image = draw_clusters(xyz, np.ones(3, np.int32), config)
@@ -163,7 +163,7 @@ def test_detections_pass_thresholds_sorted_without_overlap():
     assert same(detector(frame()), remaining[:2])
 
 
-def test_sensor_height_only_shifts_boxes():
+def test_sensor_height_changes_only_z_of_boxes():
     detector = random_detector("v4")
     scan, expected = frame(), detector(frame()).detections
     higher_scan = replace(scan, xyz=scan.xyz - np.array([0, 0, 0.5], np.float32))
@@ -208,20 +208,20 @@ def test_intensity_is_normalized_and_may_be_left_out():
     ],
 )
 @pytest.mark.parametrize("version", ["v0", "v4"])
-def test_empty_cloud_has_no_detections_and_a_problem(version, xyz, message):
+def test_empty_cloud_is_reported_as_a_problem(version, xyz, message):
     detector = random_detector(version)
     result = detector(PointCloud(np.asarray(xyz, np.float32)))
     assert len(result.detections) == 0 and message in result.problem and result.timings["network"] == 0
     assert detector(frame()).problem is None
 
 
-def test_ground_only_cloud_has_a_problem():
+def test_cloud_of_ground_only_is_reported_as_a_problem():
     detector, scan = random_detector("v4"), frame()
     result = detector(scan, ground=np.ones(len(scan), bool))
     assert len(result.detections) == 0 and "ground.sensor_pose" in result.problem
 
 
-def test_best_scores_are_reported_without_detections():
+def test_best_scores_are_reported_if_nothing_is_detected():
     detector, scan = random_detector("v4", eager(score=0.0)), frame()
     assert detector(scan).best == {}
     detections = detector(scan).detections

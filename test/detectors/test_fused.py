@@ -91,7 +91,7 @@ def make_face_points(box: np.ndarray, rng, count: int = 400) -> np.ndarray:
 
 
 @given(SEEDS)
-def test_move_to_points_corrects_shifted_car_only(seed):
+def test_move_to_points_corrects_only_a_shifted_car(seed):
     rng = np.random.default_rng(seed)
     distance = rng.uniform(8, 30)
     azimuth = rng.uniform(-np.pi, np.pi)
@@ -197,7 +197,7 @@ def test_max_probability_holds_for_any_evidence_and_curve(seed):
     np.testing.assert_array_equal(bound, np.max(probabilities, axis=0))
 
 
-def test_remove_duplicates_by_class():
+def test_duplicates_are_removed_within_each_class():
     boxes = np.array(
         [
             [10, 0, 0, 0.6, 0.6, 1.8, 0],
@@ -226,7 +226,7 @@ def detector():
     return FusedDetector(random_detector("v4").proposer, random_classifier().classifier, eager)
 
 
-def test_fused_fulfills_the_detector_contract(detector):
+def test_fused_detector_meets_the_contract(detector):
     scan = frame()
     result = detector(scan)
     assert len(result.detections) > 3 and tuple(result.timings) == STEPS
@@ -249,7 +249,7 @@ def test_fused_fulfills_the_detector_contract(detector):
         detector(scan, ground=np.zeros(3, bool))
 
 
-def test_sensor_height_and_given_columns_change_nothing(detector):
+def test_sensor_height_and_given_columns_keep_the_result(detector):
     scan = frame()
     detections = detector(scan).detections
     higher_scan = replace(scan, xyz=scan.xyz - np.array([0, 0, 0.5], np.float32))
@@ -276,7 +276,7 @@ def test_sensor_height_and_given_columns_change_nothing(detector):
 
 @pytest.mark.parametrize("use_intensity", [True, False])
 @pytest.mark.parametrize("height", [1.73, 2.5])
-def test_ground_of_experts_in_range_gives_equal_detections(detector, height, use_intensity):
+def test_ground_computed_by_a_node_gives_equal_detections(detector, height, use_intensity):
     """The ground_segmentation node segments only the range of the detector, with intensity."""
     detector_copy = detector.with_params(
         with_values(detector.params, {"fused.use_intensity": use_intensity})
@@ -322,7 +322,7 @@ def test_max_proposals_keeps_the_best_boxes(detector):
     )
 
 
-def test_classifier_box_interpolates_between_networks(detector):
+def test_classifier_box_weight_interpolates_between_networks(detector):
     def propose(weight: float) -> tuple[np.ndarray, np.ndarray]:
         detector_copy = copy.copy(detector)
         detector_copy.params = with_values(detector.params, {"fused.classifier_box": weight})
@@ -337,7 +337,7 @@ def test_classifier_box_interpolates_between_networks(detector):
     np.testing.assert_allclose(half_boxes[:, :6], (proposer_boxes + classifier_boxes)[:, :6] / 2, atol=1e-4)
 
 
-def test_hilly_ground_changes_only_the_height_of_boxes():
+def test_hills_change_only_the_height_of_boxes():
     """The networks get the points relative to flat ground."""
     detector = load_fused_detector("", "cpu", EAGER).with_range("around")
     scan = (
@@ -397,7 +397,7 @@ def test_parameters_can_change_between_clouds(detector):
     assert same(detector(frame()), detector(frame()))
 
 
-def test_clouds_without_usable_intensity_have_their_own_curves():
+def test_clouds_without_usable_intensity_use_separate_curves():
     detector = load_fused_detector("", "cpu", EAGER)
     other_curves = copy.copy(detector)
     other_curves.models = detector.models_without_intensity

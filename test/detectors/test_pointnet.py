@@ -211,7 +211,7 @@ def test_groups_equal_plain_loops(rng, name):
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_padding_points_change_nothing(rng, name):
+def test_padding_points_do_not_change_the_output(rng, name):
     net = make_network(name)
     clusters = blobs(rng, [10, 12, 2, 24, 6, 7, 40])
     inputs = make_network_input(clusters, net.config.points)
@@ -237,7 +237,7 @@ def test_batch_norms_are_folded_into_the_layers_before_them(rng):
         assert torch.allclose(output, folded_output, atol=1e-4)
 
 
-def test_every_ablation_switch_has_an_effect():
+def test_ablations_are_distinct_networks():
     configs = {name: make_pointnet_config(name) for name in ABLATIONS}
     variants = {(c.clustering, c.groups, c.mrg, c.skip) for c in configs.values()}
     assert len(variants) == len(ABLATIONS)
@@ -248,7 +248,7 @@ def test_every_ablation_switch_has_an_effect():
     assert configs["base"].clustering.euclidean.threshold == "fixed"
 
 
-def test_config_round_trip_and_invalid_values():
+def test_config_survives_json_and_rejects_invalid_values():
     config = make_pointnet_config("pointnet2", points=64)
     assert parse_config(config_module.PointNetConfig, asdict(config), "") == config
     with pytest.raises(InputError, match="unknown network 'resnet'"):
@@ -298,7 +298,7 @@ def test_decoding_undoes_encoding(rng):
     assert np.allclose(wrap_angle(decoded[:, 6] - boxes[:, 6]), 0, atol=1e-5)
 
 
-def test_loss_is_lowest_for_targets_and_ignores_background_boxes(rng):
+def test_loss_is_lowest_at_targets_and_ignores_background(rng):
     config = make_pointnet_config()
     inputs = make_network_input(blobs(rng, [5] * 6), 8)
     boxes = np.column_stack([inputs.centres, np.full((6, 3), 1.5), np.linspace(-3, 3, 6)])

@@ -14,7 +14,7 @@ from lidar_perception.types import PointCloud
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def test_clusters_of_all_sizes_and_counts_work():
+def test_clusters_of_any_size_and_number_are_accepted():
     rng = np.random.default_rng(0)
     detector = random_detector(with_values(eager(), {"pointnet.min_points": 1}))
     network, batches = detector.classifier.network, []
@@ -34,7 +34,7 @@ def test_clusters_of_all_sizes_and_counts_work():
     assert "farthest 1000 of 5000 clusters are ignored" in result.problem
 
 
-def test_excess_clusters_are_dropped_by_distance_and_counted():
+def test_most_distant_excess_clusters_are_dropped_and_counted():
     rng = np.random.default_rng(0)
     centres = np.column_stack([np.linspace(4, 60, 300), rng.uniform(-3, 3, 300), np.zeros(300)])
     rng.shuffle(centres)

@@ -34,7 +34,7 @@ def proposals():
     return Detections.of(boxes, [PEDESTRIAN, CAR, CAR, PEDESTRIAN], [0.9, 0.8, 0.5, 0.4])
 
 
-def test_clusters_are_points_in_each_box(frame, proposals):
+def test_points_in_each_box_form_a_cluster(frame, proposals):
     clusters = crop_boxes(proposals.boxes, frame, 0.2)
     assert len(clusters) == len(proposals) and clusters.sizes[3] < 5 < clusters.sizes[:3].min()
     for i, box in enumerate(proposals.boxes):
@@ -48,7 +48,7 @@ def test_clusters_are_points_in_each_box(frame, proposals):
     assert len(crop_boxes(proposals.boxes[:0], frame, 0.2)) == 0
 
 
-def test_class_of_a_proposal_does_not_depend_on_others(frame, proposals):
+def test_proposals_are_classified_independently(frame, proposals):
     classifier, ground = random_detector().classifier, np.zeros((0, 3), np.float32)
     mask = np.ones(len(proposals), bool)
     probabilities, boxes = classifier.classify(proposals, frame, ground, mask)

@@ -45,7 +45,7 @@ def assert_equal(config, clusters, seed=0):
 
 @pytest.mark.parametrize("spread", [0.05, 0.4, 3.0])
 @pytest.mark.parametrize("name", NETWORKS)
-def test_every_network_equals_torch(name, spread):
+def test_compiled_networks_equal_torch(name, spread):
     rng = np.random.default_rng(0)
     assert_equal(small(name), blobs(rng, SIZES, spread))
 
@@ -68,12 +68,12 @@ def test_every_network_equals_torch(name, spread):
         ),
     ],
 )
-def test_other_widths_equal_torch(changes):
+def test_networks_of_other_widths_equal_torch(changes):
     rng = np.random.default_rng(1)
     assert_equal(make_pointnet_config(**changes), blobs(rng, SIZES))
 
 
-def test_result_of_a_cluster_does_not_depend_on_the_batch(monkeypatch):
+def test_batching_does_not_change_results(monkeypatch):
     network = compile_network(lively(small()))
     clusters = blobs(np.random.default_rng(2), SIZES * 3)
     predictions = predict(network, clusters)

@@ -106,7 +106,7 @@ def test_cluster_ids_do_not_matter(ids):
     )
 
 
-def test_result_of_a_cluster_does_not_depend_on_others(ids):
+def test_clusters_are_classified_independently(ids):
     detector, scan = random_detector(), frame()
     expected = detector(scan, cluster_ids=ids).detections
     single_results = [
@@ -121,7 +121,7 @@ def test_result_of_a_cluster_does_not_depend_on_others(ids):
     assert are_almost_equal(combined, expected)
 
 
-def test_frame_without_clusters_has_a_problem(ids):
+def test_frame_without_clusters_is_reported_as_a_problem(ids):
     detector, scan = random_detector(), frame()
     no_clusters = np.zeros(len(scan), np.int32)
     sparse_cloud = PointCloud(np.float32([[9, 0, -1], [20, 3, 0]]), np.zeros(2, np.float32))
@@ -153,7 +153,7 @@ def test_rotated_scene_has_rotated_boxes(ids):
     assert are_almost_equal(detector(rotated_scan, cluster_ids=ids), move_detections(detections, 2.0), 2e-3)
 
 
-def test_sensor_height_only_shifts_boxes(ids):
+def test_sensor_height_changes_only_z_of_boxes(ids):
     detector, scan = random_detector(), frame()
     params = {"clustering.density": 0.0}  # the density depends on the viewpoint
     for columns in {"cluster_ids": ids}, {}:
@@ -208,7 +208,7 @@ def test_detections_pass_thresholds_sorted_without_overlap(ids):
     assert len(all_detections) > len(detector(scan, cluster_ids=split_ids).detections)
 
 
-def test_best_scores_are_reported_without_detections(ids):
+def test_best_scores_are_reported_if_nothing_is_detected(ids):
     detector, scan = random_detector(), frame()
     detections = detector(scan, cluster_ids=ids).detections
     assert detector(scan, cluster_ids=ids).best == {} and len(detections) == ids.max()
@@ -220,7 +220,7 @@ def test_best_scores_are_reported_without_detections(ids):
 
 
 @pytest.mark.parametrize("layer", ["classes", "box"])
-def test_nan_outputs_are_left_out_and_reported(layer, ids):
+def test_nan_outputs_are_dropped_and_reported(layer, ids):
     detector, scan = random_detector(), frame()
     dark_scan = replace(scan, intensity=np.where(ids == 2, np.float32(0), scan.intensity))
     expected = detector(dark_scan, cluster_ids=np.where(ids == 2, 0, ids)).detections
@@ -310,7 +310,7 @@ def copy_with_header(path, out, **changes):
     return out
 
 
-def test_checkpoint_round_trip(saved, tmp_path):
+def test_checkpoint_survives_saving_and_loading(saved, tmp_path):
     path, pointpillars_path, header = saved
     assert read_header(path) == header and read_network_name(path) == "pointnet"
     loaded_header, loaded = load_pointnet(path, header.config)
@@ -353,7 +353,7 @@ def test_weights_of_another_network_or_classes_are_rejected(saved, tmp_path):
         assert "\n" not in str(error.value)
 
 
-def test_network_with_one_class_keeps_its_class_id(ids):
+def test_class_id_of_a_single_class_network_is_kept(ids):
     config = small(classes=("Pedestrian",), sizes=small().sizes[1:2])
     detections = PointNetDetector(make_classifier(lively(config), Header(config)), eager())(
         frame(), cluster_ids=ids

@@ -69,7 +69,7 @@ def test_each_network_finds_most_clear_cars(file, scans):
 
 
 @pytest.mark.parametrize("name", ["pointnet", "fused"])
-def test_only_cars_are_moved_to_their_points(name, scans):
+def test_only_boxes_of_cars_are_moved_to_their_points(name, scans):
     detector = open_detector(name, "cpu")
     results = []
     for weight in (0.0, 1.0):

@@ -133,7 +133,7 @@ def test_shipped_sizes_equal_torch_also_at_the_border(version, size, changes):
     assert max_change.max() > 0.05 and (size == "full" or max_change.min() < 1e-6)
 
 
-def test_head_is_evaluated_near_points_only():
+def test_head_is_evaluated_only_near_points():
     config = make_config("v4", "compact", **WIDE)
     assert_equal(config, 10, 0.0, reach=sparse.REACH)
     pillars, maps = make_inputs(config, 10, 0.0)
@@ -161,7 +161,7 @@ def test_boxes_equal_torch_at_any_anchors():
         np.testing.assert_allclose(actual_values, expected_values, rtol=0, atol=TOLERANCE)
 
 
-def test_threads_and_earlier_clouds_change_nothing(monkeypatch):
+def test_result_does_not_depend_on_threads_or_earlier_clouds(monkeypatch):
     monkeypatch.setattr(sparse, "MIN_PER_PART", 1000)
     config = make_config("v4", "compact", **WIDE)
     network = make_sparse_network(make_strong_network(config))
@@ -178,7 +178,7 @@ def test_threads_and_earlier_clouds_change_nothing(monkeypatch):
     assert np.array_equal(dense_result.logits, network(*dense_inputs).logits)
 
 
-def test_an_error_in_one_part_is_raised(monkeypatch):
+def test_error_in_a_worker_thread_is_raised(monkeypatch):
     def fail(begin, end):
         if begin:
             raise ZeroDivisionError
@@ -282,7 +282,7 @@ def test_detector_of_random_weights_equals_torch(version):
     assert same(sparse_detector(cloud, **columns), result, atol=TOLERANCE)
 
 
-def test_a_cloud_without_a_pillar_detects_nothing():
+def test_cloud_without_pillars_has_no_detections():
     detector = random_detector("v4")
     proposer, config = detector.proposer, detector.proposer.config
     proposer.network = make_sparse_network(lively(config))

@@ -50,7 +50,7 @@ def saved(tmp_path):
     return tmp_path / "w.safetensors", header, network
 
 
-def test_checkpoint_round_trip(saved, tmp_path):
+def test_checkpoint_survives_saving_and_loading(saved, tmp_path):
     path, header, network = saved
     assert read_header(path) == header
     loaded_header, loaded = load_network(path, header.config)
@@ -143,7 +143,7 @@ def test_invalid_checkpoint_files_are_rejected(saved, tmp_path):
         assert "\n" not in str(error.value) and name in str(error.value)
 
 
-def test_full_disk_keeps_the_last_checkpoint(saved, monkeypatch):
+def test_last_checkpoint_survives_a_full_disk(saved, monkeypatch):
     path, header, network = saved
     content = path.read_bytes()
 

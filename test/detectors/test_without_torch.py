@@ -31,7 +31,7 @@ needs_kernels = pytest.mark.skipif(not LANES, reason="Numba compiles for a proce
 
 
 @needs_kernels
-def test_detecting_does_not_load_torch():
+def test_detection_does_not_load_torch():
     code = DETECT.format(names=["fused", "pointpillars", "pointnet"], device="cpu")
     subprocess.run([sys.executable, "-c", code], check=True)
 

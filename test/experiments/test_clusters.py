@@ -37,7 +37,7 @@ def test_perfect_clusters_score_100_with_any_numbers():
     assert found == [100] * 5 and counts["hits"] == counts["objects"] == 2
 
 
-def test_point_counts_equal_hand_computed_values():
+def test_point_scores_equal_hand_computed_values():
     # Object 1 is cut in two; its larger part also has 5 background points. Object 2 is ground.
     owner = np.repeat([1, 1, 0, 2, 0, 0], [12, 8, 5, 10, 15, 40])
     ids = np.repeat([4, 5, 4, 0, 6, 0], [12, 8, 5, 10, 15, 40])
@@ -48,13 +48,13 @@ def test_point_counts_equal_hand_computed_values():
     assert counts["objects"] == 2 and counts["hits"] == 0
 
 
-def test_neutral_points_at_the_bottom_of_a_box_do_not_count():
+def test_neutral_points_of_an_object_do_not_count():
     owner, region = np.repeat([1, 0], [10, 10]), np.ones(20)
     assert scores(np.ones(20), owner, region=region)[1] == [100] * 5
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_pairs_are_one_to_one_and_share_points(seed):
+def test_each_object_is_paired_with_one_overlapping_cluster(seed):
     rng = np.random.default_rng(seed)
     owner, ids = rng.integers(0, 5, 80), rng.integers(0, 6, 80)
     cluster_of = pair_clusters(ids, owner, 4)
@@ -64,7 +64,7 @@ def test_pairs_are_one_to_one_and_share_points(seed):
         assert ((owner == k + 1) & (ids == cluster_of[k])).any()
 
 
-def test_object_scores_of_counts():
+def test_object_scores_equal_hand_computed_values():
     counts = np.array([0, 0, 0, 0, 0, 4, 2, 3, 2.5])
     recall, precision, f1, iou = compute_object_scores(counts)
     assert (recall, precision, f1, iou) == pytest.approx((50, 200 / 3, 400 / 7, 62.5))
@@ -87,7 +87,7 @@ def test_range_image_separates_an_object_from_the_one_behind():
     assert (ids[xyz[:, 0] > 0][:3] > 0).all() and ids.dtype == np.int32
 
 
-def test_range_image_joins_clusters_across_180_degrees():
+def test_range_image_clusters_span_the_180_degree_border():
     behind = panel(-10, -0.5)  # where the azimuth jumps from 180 to -180 degrees
     assert len(np.unique(cluster_range_image(behind))) == 1
     assert (cluster_range_image(panel(10, 0)[:5]) == 0).all()
@@ -119,7 +119,7 @@ def test_frame_without_objects_is_skipped_with_a_reason(frames):
         SEGMENTATION.measure([type(frames[0]).of("x", frames[0].load())], 0)
 
 
-def test_paired_p_is_small_only_for_a_consistent_difference():
+def test_paired_p_value_is_small_for_consistent_difference():
     rng = np.random.default_rng(0)
     base = rng.integers(0, 50, (30, 1))
 

@@ -122,7 +122,7 @@ def test_experiment_without_training_runs_on_simulated_scans(tmp_path, coarse):
     assert "--split is for recordings" in str(result.exception)
 
 
-def test_sources_differ_in_gamma_and_range():
+def test_shipped_detectors_have_their_gamma_and_range():
     plain, merged, pillars = (open_network(source, 1.5, "around") for source in SHIPPED.values())
     assert plain.params.clustering.euclidean.gamma == 0.0 and merged.params.clustering.euclidean.gamma == 0.8
     assert {d.params.ground.sensor_pose.height for d in (plain, merged, pillars)} == {1.5}
@@ -173,7 +173,7 @@ def test_tiny_budget_runs_end_to_end(tmp_path, coarse, monkeypatch):
     assert report["measured"] == 1 and "Table 8" in (tmp_path / "out/report.md").read_text()
 
 
-def test_thinned_and_noisy_clouds_are_reproducible(frames):
+def test_thinning_and_noise_are_reproducible(frames):
     cloud = frames[0].load()
     half, again = (change_cloud(cloud, Change(fraction=0.5), "a") for _ in range(2))
     assert len(half) == pytest.approx(len(cloud) / 2, rel=0.2)
@@ -197,7 +197,7 @@ def test_simulated_labels_have_velocities(coarse):
             np.testing.assert_allclose((moved[i] - centre)[:2], velocity * seconds, atol=0.3)
 
 
-def test_only_the_first_frame_of_a_scene_begins_a_drive(coarse, frames):
+def test_drive_starts_at_the_first_frame_of_a_scene(coarse, frames):
     assert len(list_drive(frames, 0)) == 3 and list_drive(frames, 1) == ()
     key_frames = [
         replace(frame, native=simulate_key_frames(5)[0].native, sequence=name)
@@ -206,7 +206,7 @@ def test_only_the_first_frame_of_a_scene_begins_a_drive(coarse, frames):
     assert [len(list_drive(key_frames, i)) for i in range(4)] == [2, 0, 2, 0]
 
 
-def test_detections_get_the_velocity_of_their_track():
+def test_boxes_get_the_velocities_of_their_tracks():
     tracker, pose = Tracker(), np.eye(4)
     pose[:2, :2] = [[0, -1], [1, 0]]  # the sensor's x axis is the global y axis
     for i in range(12):
@@ -219,7 +219,7 @@ def test_detections_get_the_velocity_of_their_track():
     assert moved.velocities[1].tolist() == [0, 0]
 
 
-def test_scores_of_perfect_boxes_and_of_columns():
+def test_boxes_survive_json_and_perfect_ones_have_a_score():
     truth = GlobalBoxes.of(
         [[5, 0, 0], [9, 3, 0]], np.ones((2, 3)), np.eye(4)[[0, 0]], 0, velocities=[[1, 0], [np.nan, np.nan]]
     )

@@ -118,7 +118,7 @@ def test_candidates_are_compared_in_any_layout(bare, tmp_path):
     assert whole >= cropped > [0, 0, 0]
 
 
-def test_perfect_detector_scores_100_and_failing_one_continues(tmp_path):
+def test_failing_detector_does_not_end_the_comparison(tmp_path):
     root = object_folder(tmp_path, walker_label(), count=3)
 
     def fail(frame):
@@ -150,7 +150,7 @@ def test_pedestrians_below_the_default_threshold_do_not_count(tmp_path):
     assert row["best"]["score"] == pytest.approx(0.2)
 
 
-def test_detectors_take_turns(tmp_path):
+def test_detectors_run_in_turn_on_each_frame(tmp_path):
     for count in range(5):
         items = list(range(count))
         orders = [rotate(items, turn) for turn in range(2 * count)]
@@ -182,7 +182,7 @@ def test_mean_ignores_classes_without_labels(tmp_path):
     assert [row["ap"][name]["3d"]["moderate"] for name in SCORED] == [None, 0.0, None]
 
 
-def test_labels_in_figure_do_not_overlap():
+def test_labels_of_the_figure_do_not_overlap():
     rng = np.random.default_rng(0)
     for count in (1, 2, 5, 20, 60):
         values = rng.choice([rng.uniform(0, 100), 0, 50, 100], count) + rng.normal(0, 2, count)

@@ -47,7 +47,7 @@ def make_record(
 
 
 @pytest.mark.parametrize("calibration", [FORWARD_CAMERA, None])
-def test_record_round_trip_keeps_objects(calibration):
+def test_objects_survive_conversion_to_a_record(calibration):
     objects = to_camera_objects(
         to_scored_labels(Detections(BOXES, np.full(2, CAR, np.int32), np.array([0.9, 0.2], np.float32))), calibration
     )
@@ -57,7 +57,7 @@ def test_record_round_trip_keeps_objects(calibration):
     assert len(from_record(make_record(np.zeros((0, 7), np.float32), np.zeros(0)))) == 0
 
 
-def test_cells_equal_scores_and_samples_are_paired():
+def test_table_cells_equal_scores_of_paired_samples():
     true = [make_record(BOXES)] * 12
     perfect = [make_record(BOXES, np.array([0.9, 0.8]))] * 12
     half = [make_record(BOXES[:1], np.array([0.9]))] * 12

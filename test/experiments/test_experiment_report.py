@@ -43,7 +43,7 @@ def test_report_escapes_text(few, tmp_path):
     assert "| frame | points |" in markdown
 
 
-def test_cells_show_the_given_number_of_decimals():
+def test_table_cells_have_the_given_number_of_decimals():
     assert format_cell(Cell(1.25, 1.0, 2.0, 3.0, 2)) == ("1.25", "[1.00, 2.00]", "3.00")
     assert format_cell(Cell(None)) == ("–", "", "")
     assert format_cell(Cell(0.0, digits=0)) == ("0", "", "")

@@ -172,7 +172,7 @@ def test_error_names_the_changed_settings(few, tmp_path):
     assert len(run_experiment(SMALL, open_recording(other), out)) == 4
 
 
-def test_folder_with_other_files_is_not_touched(few, tmp_path):
+def test_folder_with_other_files_is_not_changed(few, tmp_path):
     out = tmp_path / "mine"
     write(out / "letter.txt", "dear")
     write(out / "figures/photo.png", "me")
@@ -222,7 +222,7 @@ def test_full_disk_is_reported_in_one_line_and_run_resumes(few, tmp_path, monkey
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_bug_in_experiment_ends_the_run(few, tmp_path, jobs, capfd):
+def test_exception_in_an_experiment_ends_the_run(few, tmp_path, jobs, capfd):
     if jobs > 1:
         forkserver._forkserver._stop()  # the server's processes still print to its original stderr
     with pytest.raises((ZeroDivisionError, InputError)) as error:
@@ -232,12 +232,12 @@ def test_bug_in_experiment_ends_the_run(few, tmp_path, jobs, capfd):
     assert '"000002"' not in "".join(read_lines(tmp_path / "out"))
 
 
-def test_record_must_be_json(few, tmp_path):
+def test_record_that_is_not_json_is_rejected(few, tmp_path):
     with pytest.raises(ValueError, match="JSON"):
         run_experiment(small(measure_nan), open_recording(few), tmp_path / "out")
 
 
-def test_killed_worker_ends_run_with_reason(few, tmp_path):
+def test_run_ends_with_reason_if_worker_is_killed(few, tmp_path):
     with pytest.raises(InputError, match=r"measured frames.*out of memory: try fewer --jobs"):
         run_experiment(small(kill_process), open_recording(few), tmp_path / "out", jobs=2)
 
@@ -259,7 +259,7 @@ BROKEN = {
 }
 
 
-def test_broken_frames_are_skipped_and_others_unchanged(crowds, whole, tmp_path):
+def test_broken_frame_is_skipped_without_changing_others(crowds, whole, tmp_path):
     root = tmp_path / "kitti"
     shutil.copytree(crowds, root)
     for name, change in BROKEN.items():

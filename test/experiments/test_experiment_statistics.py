@@ -68,7 +68,7 @@ def test_interval_covers_truth_at_its_level():
     assert 0.90 <= inside / 200 <= 0.99
 
 
-def test_weights_are_draws_with_replacement():
+def test_bootstrap_weights_sum_to_the_number_of_blocks():
     """Sums of one-hot frames count how often each frame was drawn."""
     counts = np.eye(6)
     seen = []
@@ -87,7 +87,7 @@ def test_equal_frames_give_an_interval_of_zero_width(counts):
 
 
 @pytest.mark.parametrize("counts", [np.zeros((0, 2)), np.zeros((8, 2))])
-def test_no_cases_give_no_value(counts):
+def test_value_without_cases_is_missing(counts):
     assert np.isnan(bootstrap(counts, share)).all()
     (cell,) = make_cells(bootstrap(counts, share))
     assert (cell.value, cell.low, cell.high, cell.paper) == (None, None, None, None)
@@ -102,7 +102,7 @@ def test_interval_depends_on_seed_and_not_on_block_size(monkeypatch):
     np.testing.assert_array_equal(first, bootstrap(counts, share))
 
 
-def test_interval_of_an_array_equals_that_of_each_element():
+def test_intervals_of_an_array_equal_those_of_its_elements():
     counts = np.random.default_rng(2).poisson(2, (60, 3, 4))
     together = bootstrap(counts, lambda sums: compute_rates(*np.moveaxis(sums, -2, 0)))
     assert together.shape == (3, 4, 3)
@@ -122,7 +122,7 @@ def test_rates_are_recall_precision_and_f1(tp, fp, fn):
         assert f1 == 0
 
 
-def test_cells_have_paper_values_and_decimals():
+def test_cells_contain_paper_value_and_number_of_decimals():
     estimates = np.array([[1.0, np.nan], [0.5, np.nan], [2.0, np.nan]])
     first, second = make_cells(estimates, (3.0, None), (1, 2))
     assert (first.value, first.low, first.high, first.paper, first.digits) == (1, 0.5, 2, 3, 1)
@@ -131,6 +131,6 @@ def test_cells_have_paper_values_and_decimals():
         make_cells(estimates, (3.0,))
 
 
-def test_stacked_counts_keep_shape_without_frames():
+def test_counts_of_no_frames_keep_their_shape():
     assert stack_counts([], 2, 3).shape == (0, 2, 3)
     assert stack_counts([[1, 2]], 2).tolist() == [[1, 2]]

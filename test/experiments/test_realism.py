@@ -105,7 +105,7 @@ def list_judged_bins(content: dict, names=CURVES) -> list[dict]:
     return [b for name in names for b in content["curves"][name]["bins"] if b["within"] is not None]
 
 
-def test_recording_agrees_with_itself():
+def test_recording_compared_with_itself_agrees():
     content = compare_scans(street(), street())
     assert content["within"] == content["judged"] == len(list_judged_bins(content)) > 100
     assert all(b["ratio"] == 1.0 and compute_factor(b) == 1.0 for b in list_judged_bins(content))
@@ -167,7 +167,7 @@ def test_counts_add_up():
         assert row.sum() == pytest.approx(1.0) if "histogram" in name else (np.diff(row) >= 0).all()
 
 
-def test_bins_with_few_real_samples_are_not_judged():
+def test_bins_of_few_real_samples_are_excluded():
     content = compare_scans(measure_scans(map(make_scan, range(MIN_SAMPLES - 1)), PAPER), street())
     assert all(content["curves"][name]["judged"] == 0 for name in (*COUNTS, *EXTENTS))
     for name, curve in content["curves"].items():
@@ -182,7 +182,7 @@ def test_missing_simulated_samples_count_as_a_difference():
     assert content["judged"] == compare_scans(street(), street())["judged"]
 
 
-def test_empty_scans_are_not_judged():
+def test_empty_scans_are_excluded():
     none = PointCloud(np.zeros((0, 3), np.float32))
     empty = Frame.of("0", none, GroundTruth.of([], []), CALIBRATION)
     for scans in ([], [empty], [Frame.of("0", none, None, CALIBRATION)]):
@@ -192,7 +192,7 @@ def test_empty_scans_are_not_judged():
         print_realism(content, Console(file=StringIO()))
 
 
-def test_scans_without_intensity_have_the_other_curves():
+def test_scans_without_intensity_have_all_other_curves():
     bare = [Frame.of(r.name, replace(r.load(), intensity=None), r.truth()) for r in map(make_scan, range(2))]
     measured = measure_scans(bare, replace(PAPER, view=replace(PAPER.view, enabled=False)))
     assert all(
@@ -202,7 +202,7 @@ def test_scans_without_intensity_have_the_other_curves():
     )
 
 
-def test_cropped_scan_counts_for_its_objects_only():
+def test_cropped_scan_contributes_only_its_objects():
     whole = make_scan(0)
     seen = np.flatnonzero(whole.camera().in_view(whole.load().xyz))
     cropped = with_scan(whole, whole.load().take(seen))
@@ -214,7 +214,7 @@ def test_cropped_scan_counts_for_its_objects_only():
     assert all(np.array_equal(rows, expected[name], equal_nan=True) for name, rows in compute_rows(cropped).items())
 
 
-def test_objects_at_image_border_do_not_count():
+def test_objects_at_the_image_border_are_excluded():
     one = make_scan(0)
     border = one.truth().boxes[:1].copy()
     while one.camera().in_view(border[:, :3]).all():
@@ -224,7 +224,7 @@ def test_objects_at_image_border_do_not_count():
 
 
 @pytest.mark.parametrize("level", [1, 2, 3])
-def test_occluded_objects_count_for_all_points_only(level):
+def test_occluded_objects_contribute_only_points_and_intensity(level):
     one = make_scan(0)
     truth = one.truth()
     truth = replace(truth, extras=tuple({"occluded": level} for _ in truth.extras))
@@ -237,7 +237,7 @@ def test_occluded_objects_count_for_all_points_only(level):
     [("behind", (-15, 1, 0)), ("the front", (12, -2, 1)), ("the side", (1, 14, 0)), ("the side", (-2, -9, 0))],
 )
 @pytest.mark.parametrize("yaw", [0.0, 2.0])
-def test_depth_behind_car_face_is_measured(face, sensor, yaw):
+def test_depth_of_points_behind_each_car_side_is_measured(face, sensor, yaw):
     size, depth = np.array([4.0, 1.8, 1.5]), 0.07
     axis, half = int(face == "the side"), size[int(face == "the side")] / 2
     own = np.random.default_rng(2).uniform(-0.5, 0.5, (60, 3)) * size
@@ -258,7 +258,7 @@ def test_depth_behind_car_face_is_measured(face, sensor, yaw):
     assert found(own[:5]) == {} == found(own, replace(box, extras=({"occluded": 1},)))
 
 
-def test_square_degrees_of_upright_and_rotated_boxes():
+def test_solid_angle_of_a_box_follows_its_visible_size():
     upright = np.array([20.0, 0, 0, 0.5, 0.5, 1.7, 0])
     expected = np.degrees(0.5 / 20) * np.degrees(1.7 / 20)
     assert compute_square_degrees(upright) == pytest.approx(expected, rel=0.01)
@@ -299,7 +299,7 @@ def test_median_within_real_interval_is_plausible():
     assert all(b["plausible"] for b in list_judged_bins(content) if b["within"])
 
 
-def test_content_survives_json_and_is_printed(tmp_path):
+def test_comparison_survives_json_and_is_printed(tmp_path):
     content = compare_scans(street(), measure_scans(map(make_scan, range(3)), PAPER))
     again = json.loads(json.dumps(content, allow_nan=False))
     assert again == content
@@ -390,7 +390,7 @@ def test_command_simulates_the_given_sensor(tmp_path):
     assert 100 < sum(b["simulated"]["median"] for b in bins) <= 4 * 180
 
 
-def test_real_scans_agree_with_themselves(data):
+def test_real_scans_compared_with_themselves_agree(data):
     scans = [r for r in open_recording(data / "kitti_object") if is_full_scan(r.load())][:2]
     first, second = (measure_scans(scans, PAPER) for _ in range(2))
     content = compare_scans(first, second)

@@ -20,12 +20,12 @@ def test_plane_is_smooth_at_any_slope(slopes):
     assert len(middle) > 400 and scatter.max() < 1e-4
 
 
-def test_scatter_equals_noise_of_the_points():
+def test_scatter_equals_the_noise_of_the_points():
     _, scatter = measure_cell_scatter(plane(1, 40_000, (0.05, 0.0), 0.03))
     assert np.sqrt((scatter**2).mean()) == pytest.approx(0.03, rel=0.04)
 
 
-def test_line_of_points_has_a_plane():
+def test_points_on_a_line_have_no_scatter():
     y = np.linspace(-10, 10, 1000)
     line = np.column_stack([np.full(1000, 8.3), y, 0.02 * y])
     assert measure_cell_scatter(line)[1].max() < 1e-3

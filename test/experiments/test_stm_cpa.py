@@ -178,7 +178,7 @@ def test_two_cpa_steps_equal_final_stage_at_15_to_30_m(refined):
     assert compared > 3
 
 
-def test_readings_and_detector_share_their_pedestrians(measured):
+def test_readings_and_detector_count_the_same_pedestrians(measured):
     for record in measured:
         assert record["readings"]["window stretched, yaw"] == record["stages"]["final"]
         for counts in (*record["readings"].values(), record["pointpillars"]):
@@ -215,13 +215,13 @@ def test_search_at_paper_setting_equals_stage_1(refined, measured):
 
 
 @pytest.mark.parametrize("moved, hits", [(0.3, True), (0.7, False)])
-def test_search_needs_closer_hits(refined, moved, hits):
+def test_search_counts_only_closer_hits(refined, moved, hits):
     labelled, segmented, seed, _ = refined[0]
     counts = search_clustering(segmented, seed, labelled.pedestrians + [0, 0, moved, 0, 0, 0, 0])
     assert (np.sum(counts, axis=(0, 2))[0] > 0) == hits
 
 
-def test_kept_pedestrians_are_hit_twice():
+def test_kept_counts_pedestrians_found_in_both_stages():
     truth = np.zeros((3, 7))
     truth[:, 0], truth[:, 3:6] = [5, 20, 40], 1
     counts = count_stage(truth[[1, 2]], truth, truth[[0, 1]])
@@ -229,7 +229,7 @@ def test_kept_pedestrians_are_hit_twice():
     assert counts["fn"] == [1, 0, 0, 0, 0] and counts["fp"] == [0] * 5
 
 
-def test_overlaps_of_known_boxes():
+def test_overlaps_of_boxes_equal_hand_computed_values():
     truth = np.array([[5, 0, 0, 1, 1, 2, 0], [20, 0, 0, 1, 1, 2, np.pi / 2.0]])
     half = truth + [0, 0, 0.5, 0, 0, -1, 0]  # upper halves of the boxes
     hits, *shares, space, bev = measure_overlaps(half, truth)
@@ -320,7 +320,7 @@ def test_protocol_equals_table_2_of_the_paper():
     assert PAPER.view.enabled and PAPER.seed.source == "ground_truth"
 
 
-def test_published_values_are_consistent():
+def test_published_tables_are_consistent():
     assert sum(paper.TABLE_1.values()) == paper.PEDESTRIANS
     assert paper.TABLE_5[0] == PAPER_TABLE_6["stage2"]
     for row in paper.TABLE_9.values():
@@ -340,7 +340,7 @@ def test_published_values_are_consistent():
 
 
 @pytest.mark.skipif(not DIGEST.is_file(), reason="the papers are not beside the checkout")
-def test_published_values_agree_with_digest():
+def test_published_tables_match_the_digest():
     text = DIGEST.read_text().partition("## B.")[0]
     cells = {
         line.split("|")[1].strip().partition(":")[0]: line.split("|")[2]

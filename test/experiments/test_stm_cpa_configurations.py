@@ -64,7 +64,7 @@ def boxes_at(places):
     return np.array([[x, y, -0.9, 0.6, 0.6, 1.7, 0] for x, y in places]).reshape(-1, 7)
 
 
-def test_seed_pedestrian_is_neither_hit_nor_miss():
+def test_seed_pedestrian_is_not_counted():
     truth = boxes_at([(5, 0), (12, 3)])
     found = ScoredBoxes(boxes_at([(5.1, 0), (20, 0)]), np.array([0.9, 0.8]), 0.5)
     counts = score_boxes(found, truth)

@@ -99,7 +99,7 @@ def test_plan_leaves_out_optional_models_for_more_steps(tmp_path, monkeypatch, l
     assert [*plan.durations] == [*plan.speeds] == planned
 
 
-def test_error_for_short_budget_suggests_a_larger_one(tmp_path):
+def test_too_short_budget_is_rejected_with_a_suggestion(tmp_path):
     with pytest.raises(InputError, match=r"too short for 20 steps.*--budget"):
         plan_training(make_request(tmp_path, budget=1e-4, params={"steps": 0}))
 
@@ -134,7 +134,7 @@ def listed(monkeypatch):
     monkeypatch.setitem(command.EXPERIMENTS, "trained", f"{__name__}:TRAINED")
 
 
-def test_command_trains_then_measures_other_scans(tmp_path, listed):
+def test_command_trains_and_measures_on_other_scans(tmp_path, listed):
     result = run("sim", "--out", tmp_path / "out", "--limit", 2)
     assert result.exit_code == 0, result.output
     assert "v0 half seed 0" in (tmp_path / "out/report.md").read_text()

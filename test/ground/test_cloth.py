@@ -45,7 +45,7 @@ def settle_slowly(obstacle, lift, steps=20_000):
 
 
 @given(st.integers(0, 2**31), st.floats(0.0001, 0.05), st.integers(1, 4))
-def test_every_cell_touches_its_obstacle_or_hangs_free(seed, lift, levels):
+def test_each_cell_rests_on_an_obstacle_or_hangs_free(seed, lift, levels):
     obstacle = make_obstacles(seed)
     sheet = settle_sheet(obstacle, lift, 1e-5, levels)
     free = free_height(sheet, obstacle, lift)
@@ -101,7 +101,7 @@ def test_climbing_road_is_ground_and_cars_on_it_are_not():
 
 
 @given(st.integers(0, 2**31), st.floats(0.01, 0.2))
-def test_climbing_cells_equal_a_plain_implementation(seed, slope):
+def test_climbing_cells_equal_the_reference(seed, slope):
     rng = np.random.default_rng(seed)
     lowest = rng.uniform(0, 0.8, (14, 18)).astype(np.float32)
     lowest[rng.random(lowest.shape) < 0.4] = UNOBSERVED
@@ -129,7 +129,7 @@ def test_climbing_cells_equal_a_plain_implementation(seed, slope):
 
 
 @given(st.integers(0, 2**31))
-def test_a_higher_obstacle_never_lowers_the_sheet(seed):
+def test_raising_an_obstacle_never_lowers_the_cloth(seed):
     obstacle = make_obstacles(seed)
     higher = obstacle.copy()
     higher[5:9, 5:9] += np.float32(1)
@@ -138,12 +138,12 @@ def test_a_higher_obstacle_never_lowers_the_sheet(seed):
 
 
 @pytest.mark.parametrize("slope", [(0, 0), (0.1, -0.05), (-0.2, 0.15)])
-def test_a_sloped_road_is_ground_and_objects_are_not(slope):
+def test_sloped_road_is_ground_and_objects_are_not(slope):
     xyz, road = street(slope=slope)
     assert f1(segment_by_cloth(xyz), road) > 0.985
 
 
-def test_a_hill_too_curved_for_a_plane_is_ground():
+def test_hill_too_curved_for_a_plane_is_ground():
     rng = np.random.default_rng(1)
     xy = rng.uniform(-40, 40, (40_000, 2))
     hill = np.column_stack([xy, 2.5 * np.cos(xy[:, 0] / 12) * np.cos(xy[:, 1] / 15)])
@@ -169,13 +169,13 @@ def test_rotating_about_z_rotates_the_ground(degrees, same):
 
 
 @pytest.mark.parametrize("far", [[1e5, 0, 0], [0, -9e4, 50], [0, 101, -1.7], [95, 80, 30], [-99, 3, -8]])
-def test_a_far_outlier_does_not_change_the_ground(far):
+def test_far_outlier_does_not_change_the_ground(far):
     xyz, _ = street(4)
     result = segment_by_cloth(np.concatenate([xyz, np.float32([far])]))[:-1]
     assert (result != segment_by_cloth(xyz)).mean() < 1e-3
 
 
-def test_reflections_below_the_ground_do_not_move_it():
+def test_reflections_below_the_ground_do_not_lower_it():
     xyz, _ = street(5)
     below = np.column_stack([np.random.default_rng(0).uniform(-30, 30, (40, 2)), np.full(40, -4.0)]).astype(np.float32)
     result = segment_by_cloth(np.concatenate([xyz, below]))

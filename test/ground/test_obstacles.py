@@ -77,7 +77,7 @@ def test_tilted_sensor_gives_the_same_obstacles():
     assert same.mean() > 0.998  # rounding moves some points into the next cell
 
 
-def test_without_ground_every_point_is_an_obstacle():
+def test_all_points_are_obstacles_without_ground():
     xyz = make_cloud(np.random.default_rng(2), 10)
     assert find_obstacles(xyz, np.zeros(10, bool), ObstacleParams(0.2, 2.0)).all()
     assert not find_obstacles(xyz, np.ones(10, bool), ObstacleParams(0.2, 2.0)).any()

@@ -25,7 +25,7 @@ def test_every_method_name_has_a_function():
 
 
 @each_method
-def test_a_flat_road_is_ground_and_objects_are_not(method):
+def test_flat_road_is_ground_and_objects_are_not(method):
     xyz, road = street()
     beyond = np.hypot(xyz[:, 0], xyz[:, 1]) > 3  # Patchwork++ ignores nearer points
     assert f1(segment(xyz, method)[beyond], road[beyond]) > 0.97
@@ -71,14 +71,14 @@ def test_unusable_points_do_not_affect_the_others(method):
 
 
 @each_method
-def test_a_million_points_are_segmented(method):
+def test_million_points_are_segmented(method):
     xyz, road = street(2, count=1_000_000)
     assert f1(segment(xyz, method), road) > 0.95
 
 
 @each_method
 @pytest.mark.parametrize("height", [0.6, 2.5])
-def test_every_method_uses_the_height_of_the_sensor(method, height):
+def test_each_method_uses_the_sensor_height(method, height):
     xyz, road = street(3)
     xyz[:, 2] += np.float32(1.73 - height)
     assert f1(segment(xyz, method, sensor_pose=SensorPoseParams(height=height)), road) > 0.97
@@ -86,7 +86,7 @@ def test_every_method_uses_the_height_of_the_sensor(method, height):
 
 @each_method
 @pytest.mark.parametrize("roll, pitch", [(0.05, 0.0), (0.0, 0.2), (-0.1, 0.3), (np.pi, 0.0), (np.pi, -0.1)])
-def test_tilted_sensor_gives_the_ground_of_a_level_one(method, roll, pitch):
+def test_tilted_and_level_sensor_give_equal_ground(method, roll, pitch):
     xyz, _ = street(4)
     pose = SensorPoseParams(roll=float(np.float32(roll)), pitch=pitch)
     axes = level_points(np.eye(3, dtype=np.float32), pose)  # rows: the levelled axes
@@ -136,7 +136,7 @@ def hilly_scene(seed):
 
 @pytest.mark.parametrize("rnr", [True, False])
 @pytest.mark.parametrize("seed", range(3))
-def test_patchwork_equals_the_library_but_for_rounding(seed, rnr):
+def test_patchwork_equals_the_library_up_to_rounding(seed, rnr):
     xyz, intensity = hilly_scene(seed)
     expected = run_library(xyz, intensity, rnr=rnr)
     result = segment_by_patchwork(xyz, intensity if rnr else None, 1.73)
@@ -169,7 +169,7 @@ def test_permuting_points_of_a_real_scan_permutes_the_ground(method):
 
 
 @each_method
-def test_the_input_is_not_modified(method):
+def test_input_is_not_modified(method):
     xyz, _ = street(6)
     before = xyz.copy()
     segment(xyz, method, np.ones(len(xyz), np.float32), sensor_pose=SensorPoseParams(pitch=0.1))

@@ -25,7 +25,7 @@ def test_surface_of_a_plane_is_the_plane(seed, along, across):
 
 
 @given(SEEDS, st.floats(-300, 300), st.floats(-300, 300))
-def test_shifting_points_shifts_the_surface(seed, z, cells):
+def test_surface_shifts_with_the_points(seed, z, cells):
     rng = np.random.default_rng(seed)
     ground = rng.uniform([-20, -20, -2], [20, 20, -1], (3000, 3))
     shift = np.array([round(cells) * CELL_M, -round(cells) * CELL_M, z])
@@ -40,7 +40,7 @@ def test_shifting_points_shifts_the_surface(seed, z, cells):
     np.testing.assert_allclose(far, surface.height_at(places + [20_000, 0]))
 
 
-def test_surface_without_enough_points_has_the_default_height():
+def test_surface_of_too_few_points_has_the_default_height():
     places = np.array([[0.0, 0.0], [50.0, -3.0]])
     for count in (0, MIN_POINTS - 1):
         surface = fit_ground_surface(np.zeros((count, 3)), -1.5)

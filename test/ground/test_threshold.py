@@ -50,7 +50,7 @@ def real_scans(*numbers):
 
 
 @given(st.integers(0, 2**31), slopes, slopes, st.floats(-3, -1.3))
-def test_the_plane_is_accurate_with_40_percent_outliers(seed, a, b, c):
+def test_plane_is_accurate_with_40_percent_outliers(seed, a, b, c):
     true = np.array([a, b, c])
     xyz = sloped_scene(seed, true)
     result = fit_plane_by_ransac(xyz, ThresholdParams(max_height=100.0))
@@ -59,7 +59,7 @@ def test_the_plane_is_accurate_with_40_percent_outliers(seed, a, b, c):
 
 
 @given(st.integers(0, 2**31), slopes, slopes)
-def test_ground_is_every_point_within_inlier_distance(seed, a, b):
+def test_all_points_within_inlier_distance_are_ground(seed, a, b):
     xyz = sloped_scene(seed, [a, b, -1.7])
     params = ThresholdParams(max_height=0.73, inlier_distance=0.07)
     plane = find_plane(xyz, params, sensor_height=1.73)
@@ -70,7 +70,7 @@ def test_ground_is_every_point_within_inlier_distance(seed, a, b):
 
 
 @given(st.integers(0, 2**31), slopes, slopes, st.sampled_from([0.0, 300.0, 5000.0]))
-def test_the_plane_is_a_fixed_point_of_fitting(seed, a, b, offset):
+def test_fitting_the_ground_of_a_plane_keeps_the_plane(seed, a, b, offset):
     xyz = sloped_scene(seed, [a, b, -1.7])
     xyz[:, 0] += np.float32(offset)
     params = ThresholdParams(max_height=100.0)
@@ -181,7 +181,7 @@ def test_clouds_without_ground_give_an_empty_mask(xyz):
     assert ground.shape == (len(xyz),) and ground.dtype == bool and not ground.any()
 
 
-def test_three_points_are_enough_for_a_plane():
+def test_plane_is_fitted_to_three_points():
     xyz = np.float32([[0, 0, -2], [4, 0, -2.5], [0, 4, -1.75]])
     np.testing.assert_allclose(fit_plane_by_ransac(xyz, ThresholdParams()), [-0.125, 0.0625, -2], atol=1e-9)
     assert segment_by_threshold(xyz).all()
@@ -194,7 +194,7 @@ def test_fit_plane_needs_three_points_not_on_a_line():
     assert fit_plane(np.float32([[0, 0, 0], [1, 1, 0], [2, 2, 5], [5, 6, 1]])) is not None
 
 
-def test_a_plane_steeper_than_max_slope_is_not_ground():
+def test_plane_steeper_than_max_slope_is_not_ground():
     steep = sloped_scene(1, [np.tan(np.radians(20)), 0, -20], outliers=0, noise=0.0)
     assert segment_by_threshold(steep, ThresholdParams(max_slope=21.0, max_height=5.0)).mean() > 0.9
     assert not segment_by_threshold(steep, ThresholdParams(max_slope=5.0, max_height=5.0)).any()
@@ -209,7 +209,7 @@ def test_ground_continues_where_the_road_rises_above_max_height():
     assert ground.sum() < 1.1 * on_plane.sum()
 
 
-def test_max_height_counts_from_the_ground_under_the_sensor():
+def test_max_height_is_relative_to_the_ground_below_the_sensor():
     """A second, larger plane 0.5 m higher counts only if max_height reaches it."""
     rng = np.random.default_rng(0)
     floor, table = (
@@ -222,7 +222,7 @@ def test_max_height_counts_from_the_ground_under_the_sensor():
         np.testing.assert_allclose(plane, [0, 0, expected], atol=1e-6)
 
 
-def test_the_result_is_repeatable_and_the_input_not_modified():
+def test_result_is_repeatable_and_the_input_not_modified():
     xyz = sloped_scene(3, [0.05, 0.02, -1.8])
     before = xyz.copy()
     first = segment_by_threshold(xyz)

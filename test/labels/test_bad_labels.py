@@ -109,7 +109,7 @@ def write_labels(folder, format, old="", new=""):
 
 
 @pytest.mark.parametrize("format", VALID)
-def test_the_unchanged_examples_are_valid(format, tmp_path):
+def test_unchanged_examples_are_valid(format, tmp_path):
     path = write_labels(tmp_path / "in", format)
     assert recognise_format(path) == format
     assert import_labels(path, format, drive("one")).box_count == 1
@@ -249,7 +249,7 @@ def limit_file_size():
 
 
 @pytest.mark.parametrize("format", sorted(FORMATS.keys() - {"mcap", "mcap-labels"}))
-def test_nothing_is_partly_written_on_a_full_disk(format, tmp_path, limit_file_size):
+def test_full_disk_leaves_no_partial_labels(format, tmp_path, limit_file_size):
     frames = drive("one")
     export_labels(make_labels(frames, format), format, tmp_path / "old", frames)
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}

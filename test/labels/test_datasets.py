@@ -129,7 +129,7 @@ def frames_at(seconds, **more):
 
 
 @pytest.mark.parametrize("kind", ["tables", "results"])
-def test_labels_of_a_tilted_vehicle_are_written_as_read(kind, tmp_path):
+def test_labels_of_a_tilted_vehicle_survive_conversion(kind, tmp_path):
     """nuScenes boxes are upright in the global frame, those of the package in the vehicle frame."""
     tables = make_tables(frames=2, objects=8, scenes=("scene-0001",))
     recording = open_recording(save(tmp_path / "there", tables))
@@ -151,7 +151,7 @@ def test_labels_of_a_tilted_vehicle_are_written_as_read(kind, tmp_path):
         assert kind == "results" or [row[key] for key in counts] == [old[key] for key in counts]
 
 
-def test_missing_camera_is_assumed_and_numbers_follow_time(tmp_path):
+def test_camera_is_assumed_and_frame_numbers_follow_time(tmp_path):
     """A missing scan leaves a gap in the numbers; after a longer gap a new drive starts."""
     frames = frames_at([0, 0.1, 0.31, 0.4, 30, 30.07, 30.13], pose=np.eye(4).copy)
     labels = make_labels(frames, "kitti-tracking")
@@ -184,7 +184,7 @@ def test_sensor_height_is_kept(tmp_path, layout, height):
     assert open_recording(tmp_path / "folder", sensor_height=1.0).frames[0].sensor_height == 1.0
 
 
-def test_point_labels_are_written_where_the_layout_has_them(tmp_path, monkeypatch, capsys):
+def test_point_labels_are_written_if_the_layout_has_them(tmp_path, monkeypatch, capsys):
     points = PointTruth(np.array([40, 252, 0], np.uint16), np.array([0, 7, 65535], np.uint16))
     write_bag(tmp_path / "labelled", frames_at([0, 0.1], point_truth=lambda: points, calibration=CALIBRATION))
     write_bag(tmp_path / "bare", frames_at([0, 0.1]))

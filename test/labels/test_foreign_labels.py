@@ -79,7 +79,7 @@ def test_labelcloud_vertices_give_heading_and_sides(tmp_path):
     np.testing.assert_allclose(read.frames[0].boxes[0], BOX, atol=1e-7)
 
 
-def test_openlabel_cuboid_has_its_x_axis_to_the_front(tmp_path):
+def test_openlabel_cuboid_heads_along_its_x_axis(tmp_path):
     content = json.loads(export_box("openlabel", tmp_path / "o.json").read_text())["openlabel"]
     element = content["frames"]["5"]["objects"]["7"]["object_data"]
     val = element["cuboid"][0]["val"]
@@ -229,7 +229,7 @@ TILTED = {
 
 
 @pytest.mark.parametrize("format", TILTED)
-def test_tilted_box_is_kept_until_it_is_moved(format, tmp_path):
+def test_tilt_of_a_box_is_kept_until_it_is_moved(format, tmp_path):
     (tmp_path / "in").mkdir()
     (tmp_path / "in/000005.json").write_text(json.dumps(TILTED[format]))
     frames = make_one_frame()
@@ -258,7 +258,7 @@ def test_tilted_box_is_kept_until_it_is_moved(format, tmp_path):
 @pytest.mark.parametrize(
     ("format", "key"), [("sustech", "obj_id"), ("openlabel", "uid"), ("nuscenes-tracking", "tracking_id")]
 )
-def test_track_name_goes_to_one_part_of_a_split_track(format, key, tmp_path):
+def test_one_part_of_a_split_track_keeps_its_name(format, key, tmp_path):
     name = "0b3f7a52-5a7e-4a9b-9a3e-0d2c6f1b8e11"
     (frame,) = frames = make_one_frame()
     before = FrameLabels.of(
@@ -337,7 +337,7 @@ def test_cuboid_in_other_axes_keeps_its_sizes(tmp_path, case, numbers, turn):
     assert labels.class_names == ["Car"]
 
 
-def test_camera_without_lidar_uses_the_calibration_of_the_drive(tmp_path):
+def test_camera_without_pose_uses_calibration_of_the_drive(tmp_path):
     frames = make_one_frame()
     path = write_openlabel(
         tmp_path / "o.json",

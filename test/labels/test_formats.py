@@ -94,6 +94,6 @@ def test_only_moved_boxes_get_new_columns(tmp_path):
     assert 600 < float(left) < float(right) < 700 and 150 < float(top) < float(bottom) < 250
 
 
-def test_hidden_boxes_are_occluded():
+def test_hidden_boxes_are_exported_as_occluded():
     pixels = np.array([[0, 0, 10, 10], [5, 0, 15, 10], [2, 2, 8, 8], [np.nan] * 4])
     assert compute_occlusion_levels(pixels, np.array([5.0, 10, 20, 1])).tolist() == [0, 2, 2, 0]

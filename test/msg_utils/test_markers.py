@@ -59,7 +59,7 @@ def same_boxes(a, b) -> bool:
 
 @each_make
 @given(rows=objects, remarks=notes)
-def test_marker_array_round_trip(make, rows, remarks):
+def test_marker_array_survives_conversion_and_back(make, rows, remarks):
     result = from_marker_array(
         array(
             make,
@@ -125,7 +125,7 @@ def test_empty_array_keeps_frame_and_stamp(make):
 
 
 @each_make
-def test_a_message_without_markers_is_empty(make):
+def test_message_without_markers_has_no_detections(make):
     result = from_marker_array(make("visualization_msgs/msg/MarkerArray", markers=[]))
     assert (len(result), result.stamp_ns, result.frame_id) == (0, 0, "")
 
@@ -177,7 +177,7 @@ def test_arrays_of_different_length_are_rejected(make):
 
 
 @each_make
-def test_lifetime_and_color_reach_every_cube(make):
+def test_each_cube_has_the_given_lifetime_and_color(make):
     rows = [((0, 0, 0, 1, 1, 1, 0), label, 1.0, {}) for label in ("Car", "unheard of")]
     msg = array(make, rows, color=(0.25, 0.5, 1.0), lifetime_ns=1_500_000_000)
     for m in msg.markers:
@@ -187,7 +187,7 @@ def test_lifetime_and_color_reach_every_cube(make):
 
 @each_make
 @pytest.mark.parametrize("tracks, ids", [([4, 9], [4, 9]), ([4, None], [0, 1]), ([4, 4], [0, 1]), ([], [])])
-def test_track_id_is_kept_if_it_distinguishes_labels(make, tracks, ids):
+def test_unique_track_ids_become_detection_ids(make, tracks, ids):
     extras = [{} if t is None else {"track_id": t} for t in tracks]
     truth = GroundTruth.of(np.ones((len(tracks), 7)), [0] * len(tracks), extras, [("DontCare", {"track_id": -1})])
     result = from_marker_array(make_truth_markers(truth, header(make), make))
@@ -196,7 +196,7 @@ def test_track_id_is_kept_if_it_distinguishes_labels(make, tracks, ids):
 
 
 @given(rows=objects)
-def test_detection_array_round_trip(rows):
+def test_detection_array_survives_conversion_and_back(rows):
     msg = to_detection_array(
         np.array([r[0] for r in rows]),
         [r[1] for r in rows],

@@ -119,7 +119,7 @@ def same(a: np.ndarray, b: np.ndarray) -> bool:
 
 @each_make
 @given(cloud=points())
-def test_array_round_trip(make, cloud):
+def test_array_survives_conversion_to_a_cloud_and_back(make, cloud):
     result = to_array(from_array(cloud, header(make), make))
     assert result.dtype == cloud.dtype
     assert result.tobytes() == cloud.tobytes()
@@ -152,7 +152,7 @@ def test_padding_at_the_end_of_a_row_is_not_read(make, cloud, height, pad):
 
 
 @each_make
-def test_the_last_row_needs_no_padding(make):
+def test_last_row_needs_no_padding(make):
     cloud = np.arange(12, dtype="<f4").view(XYZ)
     msg = padded(make, cloud, 2, 8)
     msg.data = msg.data[:-8]
@@ -168,7 +168,7 @@ def test_fields_without_a_name_are_padding(make):
 
 
 @each_make
-def test_a_count_of_zero_is_one_number(make):
+def test_field_count_of_zero_is_read_as_one(make):
     msg = message(make, [field(make, "x", 0, count=0)], np.zeros(4, np.uint8), point_step=4)
     assert compute_dtype(msg)["x"] == np.dtype("<f4")
 
@@ -217,7 +217,7 @@ def test_last_of_two_equal_columns_is_used(make, cloud):
 @each_make
 @pytest.mark.parametrize("old", [("i", "<f4"), ("i", "<i4", (2,)), ("i", "<u4")])
 @pytest.mark.parametrize("order", "<>")
-def test_a_column_of_another_shape_or_type_is_replaced(make, old, order):
+def test_column_of_another_shape_or_type_is_replaced(make, old, order):
     dtype = np.dtype([("x", "<f4"), old, ("y", "<f8")]).newbyteorder(order)
     cloud = np.zeros(3, dtype)
     cloud["x"], cloud["y"] = [1, 2, 3], [4, 5, 6]
@@ -228,7 +228,7 @@ def test_a_column_of_another_shape_or_type_is_replaced(make, old, order):
 
 
 @each_make
-def test_an_empty_cloud_stays_empty(make):
+def test_empty_cloud_stays_empty(make):
     empty = message(make, [], np.zeros(0, np.uint8), width=0, point_step=0)
     assert len(to_array(empty)) == 0
     result = to_array(add_columns(empty, make, label=np.zeros(0, np.uint8)))
@@ -316,7 +316,7 @@ def test_error_names_the_broken_part_of_a_cloud(make, change, words):
 @pytest.mark.parametrize(
     "dtype", [[("x", "<f4"), ("y", ">f4")], [("x", "f2")], [("x", "i8")], [("x", "?")], [("x", "S4")]]
 )
-def test_types_that_point_cloud2_lacks_are_rejected(make, dtype):
+def test_types_unknown_to_point_cloud2_are_rejected(make, dtype):
     with pytest.raises(ValueError):
         from_array(np.zeros(2, dtype), header(make), make)
 

@@ -47,7 +47,7 @@ def test_near_points_hide_far_ones(rng):
 
 
 @given(seeds())
-def test_line_covers_pixels_within_its_width(rng):
+def test_drawn_line_has_the_given_width(rng):
     start, end = rng.uniform(-20, 40, (2, 2))
     if np.hypot(*(end - start)) < 1:
         return
@@ -86,7 +86,7 @@ def test_canvas_skips_invalid_and_outside_shapes():
     assert not canvas.pixels.any()
 
 
-def test_polygon_covers_its_inside():
+def test_polygon_fills_its_interior():
     for corners in np.array([[2, 3], [12, 3], [12, 9], [2, 9]]), np.array([[2, 9], [12, 9], [12, 3], [2, 3]]):
         canvas = Canvas(*SIZE)
         canvas.fill_polygon(corners, GREEN, 0.5)
@@ -118,7 +118,7 @@ def test_view_keeps_lines_straight(name, rng):
     assert np.isnan(cut).all() == bool((depth[[0, -1]] < NEAR).all())
 
 
-def test_views_point_ahead():
+def test_views_look_ahead():
     behind, above = VIEWS.values()
     pixels, depth = behind.project(np.array([[10.0, 0, 0], [10, 3, 0], [10, 0, 3], [-30, 0, 0]]))
     np.testing.assert_allclose(pixels[0], [40, 30], atol=1e-9)

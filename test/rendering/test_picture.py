@@ -108,7 +108,7 @@ def test_view_covers_the_range_of_the_first_cloud(far, reach):
 
 
 @pytest.mark.parametrize("width", [480, 800, 1280])
-def test_color_scale_does_not_cover_the_classes(width):
+def test_color_scale_does_not_overlap_the_class_names(width):
     stage = Stage(30.0, True, -1.73, width=width, height=270)
     found = Boxes(np.repeat(BOX, 3, axis=0), np.array([CAR, PEDESTRIAN, CLASSES.index("Cyclist")]))
     *classes, scale, _ = _draw_legend(Canvas(width, 270, BACKGROUND), stage, found, BOX, True)

@@ -78,7 +78,7 @@ def test_rotated_sector_keeps_rotated_points(seed, angle):
     np.testing.assert_array_equal(before[~near], after[~near])
 
 
-def test_body_is_box_in_base_frame():
+def test_body_crop_applies_in_the_base_frame():
     base = np.eye(4)
     base[:3, :3] = Rotation.from_euler("zyx", [2.0, 0.4, -0.3]).as_matrix()
     base[:3, 3] = 0.5, -0.2, 1.1
@@ -90,7 +90,7 @@ def test_body_is_box_in_base_frame():
 
 
 @pytest.mark.parametrize("roll, pitch, ahead", [(0, 0, 180), (180, 0, 0), (15, -20, 90)])
-def test_sectors_do_not_depend_on_mounting(roll, pitch, ahead):
+def test_cropped_sectors_do_not_depend_on_the_mount(roll, pitch, ahead):
     level = find_level_transform(make_tilted_pose(*np.radians([roll, pitch])), np.radians(ahead))
     straight = make_points().astype(np.float64)
     params = CropParams(sectors=(150.0, 210.0, 60.0, 90.0), min_range=2.0)
@@ -100,7 +100,7 @@ def test_sectors_do_not_depend_on_mounting(roll, pitch, ahead):
     )
 
 
-def test_disabled_crop_returns_same_frame():
+def test_disabled_crop_returns_the_same_frame():
     frame = PointCloud(make_points())
     indices, same = crop_frame(frame, CropParams())
     assert same is frame and indices.tolist() == list(range(len(frame)))

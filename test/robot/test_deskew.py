@@ -44,7 +44,7 @@ def test_deskew_equals_loop_over_points():
     assert np.abs(np.array(expected) - xyz[:40]).max() > 0.5
 
 
-def test_points_of_static_sensor_do_not_move():
+def test_points_of_a_static_sensor_are_not_moved():
     xyz, seconds = make_sweep()
     pose = np.tile(np.eye(4), (1, 1, 1))
     pose[0, :3, :3] = Rotation.from_rotvec([0.3, 1.0, -2.0]).as_matrix()
@@ -58,7 +58,7 @@ def test_points_of_static_sensor_do_not_move():
 
 
 @pytest.mark.parametrize("count", [10, 100_000])
-def test_poses_are_looked_up_once_and_for_few_times(count):
+def test_poses_are_looked_up_once_for_few_distinct_times(count):
     xyz, seconds = make_sweep(count)
     calls = []
 
@@ -70,7 +70,7 @@ def test_poses_are_looked_up_once_and_for_few_times(count):
     assert calls == [MAX_POSES + 1]
 
 
-def test_car_with_constant_motion_drives_a_circle():
+def test_constant_speed_and_turn_rate_give_a_circle():
     """At 10 m/s and 0.5 rad/s, the radius is 20 m."""
     at = np.linspace(-1, 1, 21)
     poses = make_constant_motion([10.0, 0, 0], [0, 0, 0.5])(at)

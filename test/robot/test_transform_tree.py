@@ -146,7 +146,7 @@ def test_error_names_unconnected_frames():
         tree.lookup("map", "tower", START)
 
 
-def test_loop_of_transforms_is_an_error():
+def test_loop_of_transforms_is_rejected():
     tree = TransformTree()
     for parent, child in (("a", "b"), ("b", "c"), ("c", "a")):
         tree.set(parent, child, 0, [0, 0, 0], [0, 0, 0, 1], static=True)
@@ -183,7 +183,7 @@ class CountingStamp(int):
         return int(self) > int(other)
 
 
-def test_inserting_old_stamps_takes_logarithmic_time():
+def test_inserting_old_transforms_takes_logarithmic_time():
     tree = TransformTree(keeps_all=True)
     for first in (0, 5):
         for i in range(500):
@@ -192,7 +192,7 @@ def test_inserting_old_stamps_takes_logarithmic_time():
     assert [tree.lookup("a", "b", 5 * i)[0, 3] for i in range(1000)] == [*range(1000)]
 
 
-def test_memory_is_bounded(monkeypatch):
+def test_memory_of_transforms_is_bounded(monkeypatch):
     """Time, number of poses and number of frames are bounded."""
     monkeypatch.setattr(transform_tree, "MAX_HISTORY", 100)
     monkeypatch.setattr(transform_tree, "MAX_FRAMES", 3)

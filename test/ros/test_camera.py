@@ -36,7 +36,7 @@ def offline(frame):
     [(CANDIDATES_GRAPH, LATCHED), (SINGLE_PROCESS_CANDIDATES, SENSOR_DATA)],
     ids=["three nodes, latched", "one node, a driver's"],
 )
-def test_a_cloud_before_its_camera_gives_the_offline_detections(graph, qos, processes, peer, drive_bag):
+def test_cloud_before_its_camera_info_gives_offline_detections(graph, qos, processes, peer, drive_bag):
     frame, expected = next((f, e) for f in open_recording(drive_bag) if len(e := offline(f)))
     with Bag(drive_bag) as bag:
         sent = {

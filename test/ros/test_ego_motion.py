@@ -77,7 +77,7 @@ def test_odometry_is_transformed_to_the_sensor(start, source):
     assert node.diagnostics.state[1] == "tracking"
 
 
-def test_detections_in_the_frame_of_the_odometry_do_not_move(start):
+def test_detections_in_the_odometry_frame_are_not_moved(start):
     node = start(TrackerNode)
     drive(
         node,
@@ -210,7 +210,7 @@ def test_stopped_or_foreign_clock_odometry_is_reported(start, monkeypatch):
 
 
 @pytest.mark.parametrize("source, lag", [("odometry", 3.0), ("tf", 0.7)])
-def test_source_that_is_always_late_is_reported(start, source, lag):
+def test_pose_source_that_is_always_late_is_reported(start, source, lag):
     """The lag is longer than ego.max_gap and too short for a different clock."""
     node = start(TrackerNode, **{"ego.source": source})
     for i in range(15):

@@ -32,7 +32,7 @@ def list_problems(node):
 
 
 @pytest.mark.parametrize("late", [0, MAX_INCOMPLETE_FRAMES - 1, MAX_INCOMPLETE_FRAMES + 30])
-def test_labels_may_be_late_and_lost_frames_count_once(start, late):
+def test_late_labels_are_scored_and_lost_frames_counted_once(start, late):
     node, count = start(Evaluator), 300
     for i in range(count + late):
         if i < count:
@@ -102,7 +102,7 @@ def objects(stamp, cars=(), cyclists=(), pedestrians=()):
 
 
 @pytest.mark.parametrize("with_camera", [False, True])
-def test_all_classes_are_scored_and_precision_at_the_end(with_camera, start, tmp_path):
+def test_all_classes_are_scored_and_ap_at_the_end(with_camera, start, tmp_path):
     file = tmp_path / "scores.json"
     node = start(Evaluator, file=str(file))
     if with_camera:

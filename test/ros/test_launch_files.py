@@ -85,7 +85,7 @@ def test_launch_file_starts_its_graph_or_single_detectors(name, launched):
 @pytest.mark.parametrize(
     ("processes", "cores", "together"), [("true", 2, False), ("false", 16, True), ("auto", 4, True), ("auto", 5, False)]
 )
-def test_graph_is_one_process_on_request_or_on_few_cores(processes, cores, together, launched, monkeypatch):
+def test_graph_is_one_process_if_requested_or_on_few_cores(processes, cores, together, launched, monkeypatch):
     monkeypatch.setattr(graph_module, "count_cores", lambda: cores)
     nodes = launched("detectors")
     given = dict(
@@ -135,7 +135,7 @@ def test_graph_is_one_process_on_request_or_on_few_cores(processes, cores, toget
         ("fused", {"config": "range: all"}, None),
     ],
 )
-def test_experts_have_the_range_of_the_detectors(detectors, given, expected, launched, tmp_path):
+def test_expert_nodes_use_the_range_of_the_detectors(detectors, given, expected, launched, tmp_path):
     nodes = launched("detectors")
     if "config" in given:
         mine = tmp_path / "mine.yaml"
@@ -145,7 +145,7 @@ def test_experts_have_the_range_of_the_detectors(detectors, given, expected, lau
     assert (last.get("range") if isinstance(last, dict) else None) == expected
 
 
-def test_experts_choose_the_file_of_ground_and_clusters(launched, tmp_path):
+def test_ground_and_clustering_file_depends_on_experts(launched, tmp_path):
     nodes = launched("detectors")
     mine = tmp_path / "mine.yaml"
     mine.write_text("")
@@ -291,7 +291,7 @@ def test_tracking_adds_a_tracker_to_each_detector(launched):
     assert "tracker" not in nodes(detectors="pointpillars")
 
 
-def test_tracking_in_one_process_is_a_parameter_of_the_detector(launched):
+def test_single_process_tracks_inside_the_detector(launched):
     nodes = launched("detectors")
     for name, node in nodes(tracking="true", single="true").items():
         assert node.executable != "tracker" and node.parameters[1]["tracking.enabled"] is True
@@ -299,7 +299,7 @@ def test_tracking_in_one_process_is_a_parameter_of_the_detector(launched):
         assert ("~/input/odometry", "odom") in node.remappings
 
 
-def test_rviz_follows_the_names_of_the_graph(launched):
+def test_rviz_topics_follow_the_names_of_the_graph(launched):
     nodes = launched("detectors")
     assert "rviz2" not in nodes()
     plain = nodes(rviz="true", detectors=SEVERAL, points="/cloud", rviz_frame="base_link", namespace="left")["rviz2"]

@@ -190,7 +190,7 @@ def test_cleanup_frees_the_network(here, peer, weights):
         assert entities(node) == empty and set(vars(node)) == names
 
 
-def test_simulated_clock_continues_after_cleanup(here, peer):
+def test_simulated_clock_works_after_cleanup(here, peer):
     """use_sim_time may be set before or after the node is configured."""
     name, clock = "ground_segmentation", "rosgraph_msgs/msg/Clock"
     node, talker = here(GroundSegmentation, {}, {}), peer.advertise("/clock", clock)

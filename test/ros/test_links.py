@@ -78,7 +78,7 @@ def test_linked_nodes_pass_messages_without_dds(graph, monkeypatch):
     assert graph.reception.values() == {"lost": 0, "dropped": 0, "reliability": "in this process"}
 
 
-def test_newest_linked_message_is_kept_and_others_dropped(graph, monkeypatch):
+def test_only_the_newest_linked_message_is_kept(graph, monkeypatch):
     received = []
     monkeypatch.setattr(graph.reception, "deliver", lambda msg, _: received.append(msg))
     graph.ground.on_points(make_cloud(10**18))
@@ -100,7 +100,7 @@ def test_second_publisher_ends_the_link(graph, monkeypatch):
     assert graph.reception.subscription is None and graph.ground.points.receivers
 
 
-def test_link_ends_with_its_nodes(graph):
+def test_link_is_removed_and_restored_with_its_nodes(graph):
     assert graph.ground.points.receivers
     graph.clustering.trigger_deactivate()
     assert not graph.ground.points.receivers
@@ -138,7 +138,7 @@ def test_recorder_gets_linked_messages_without_dds(graph, monkeypatch, tmp_path)
     assert {f.name for f in messages[0].fields} >= {"ground", "in_view"}
 
 
-def test_tracker_reads_the_same_objects_from_rows_and_from_cdr():
+def test_tracker_reads_equal_objects_from_rows_and_cdr():
     rng = np.random.default_rng(0)
     found = Detections.of(rng.normal(0, 5, (20, 7)) ** 2, rng.integers(0, 3, 20), rng.random(20))
     header = make_header(10**18 + 5, "velodyne", make_bag_message)

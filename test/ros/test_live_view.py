@@ -145,7 +145,7 @@ def test_newest_frame_appears_and_replay_can_pause(view, received, shared_peer):
         assert page.locator("#errors .toast").count() == 0
 
 
-def test_boxes_in_another_frame_are_shown_where_tf_says(view, received, shared_peer):
+def test_boxes_in_another_frame_are_transformed_by_tf(view, received, shared_peer):
     """The boxes of the detector, as a node with a target_frame publishes them."""
     talker, place = shared_peer.advertise("/robot/output/detections", MARKERS), mount_pose(0.5, 0.2, 1.7, 0.0, 0.0, 0.3)
     sent = 0

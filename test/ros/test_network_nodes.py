@@ -130,7 +130,7 @@ def test_bad_clouds_are_reported_and_the_node_continues(tested, talker, found, s
     assert "Traceback" not in log and "Warning" not in log
 
 
-def test_thresholds_change_at_run_time_others_are_fixed(tested, talker, found, peer):
+def test_only_thresholds_can_change_at_run_time(tested, talker, found, peer):
     network = tested.network
     for name, value, words in [
         (f"{network}.weights", "other.safetensors", "read-only"),
@@ -283,7 +283,7 @@ def test_help_lists_parameters(node, words, capsys):
 
 
 @pytest.mark.parametrize("range", ["ahead", "around"])
-def test_experts_segment_the_points_that_the_detector_reads(start, range):
+def test_expert_nodes_segment_the_points_of_the_detector(start, range):
     """The ground equals that of the detector, and the published parts contain all points of the cloud."""
     node = start(GroundSegmentation, range=range, **{"ground.method": "patchwork"})
     assert read_header(find_fused_weights(FusedParams()), NetworkConfig).config.low == AHEAD["low"]

@@ -204,7 +204,7 @@ def test_unused_inputs_change_nothing(perception, shared_peer, talker, good_clou
     assert "Error" not in perception.read_log("perception")
 
 
-def test_old_markers_are_deleted_and_time_jumps_noticed(perception, shared_peer, talker, good_cloud):
+def test_old_markers_are_deleted_and_time_jumps_reported(perception, shared_peer, talker, good_cloud):
     peer, received = shared_peer, shared_peer.listen("/perception/output/boxes", MARKERS)
     peer.send(talker, good_cloud, lambda: received, "boxes")
     full = from_marker_array(received[-1])
@@ -217,7 +217,7 @@ def test_old_markers_are_deleted_and_time_jumps_noticed(perception, shared_peer,
     peer.wait(lambda: "time jumped back" in perception.read_log("perception"), "the log line")
 
 
-def test_restarted_bag_pairs_clouds_of_the_new_round():
+def test_clouds_of_a_restarted_bag_are_paired():
     """After the jump in time, no message of the previous round is delivered."""
     for first in ("cloud", "partner"):
         delivered, dropped = [], []
@@ -234,7 +234,7 @@ def test_restarted_bag_pairs_clouds_of_the_new_round():
         assert dropped == [1, 1] and len(delivered) == 90
 
 
-def test_clouds_wait_for_the_partner_with_their_stamp():
+def test_clouds_wait_for_the_message_with_equal_stamp():
     """For any order of arrival, clouds are delivered in order with their partners; a cloud whose partner is lost
     is delivered without one."""
     rng = np.random.default_rng(0)

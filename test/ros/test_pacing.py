@@ -49,7 +49,7 @@ def test_player_limits_clouds_in_flight():
         assert answers and pace.unanswered <= 40 * len(topics)
 
 
-def test_late_answer_counts_earlier_clouds_as_missed():
+def test_answer_marks_earlier_clouds_as_missed():
     pace = pace_of(["/a"], 2)
     for number in range(3):
         pace.add_cloud(b"\0" * 4 + stamp(number))
@@ -59,7 +59,7 @@ def test_late_answer_counts_earlier_clouds_as_missed():
     assert pace.unanswered == 1 and not pace.waiting
 
 
-def test_player_waits_long_for_a_silent_graph_only_once(monkeypatch):
+def test_player_waits_full_timeout_only_once(monkeypatch):
     now = 0.0
     monkeypatch.setattr(pacing, "monotonic", lambda: now)
 
@@ -91,7 +91,7 @@ def test_cloud_topics_are_found_or_the_existing_ones_are_listed():
 
 
 @pytest.mark.parametrize("own", [{}, {"OMP_WAIT_POLICY": "active"}], ids=["ours", "the user's"])
-def test_waiting_threads_sleep_unless_configured_otherwise(own):
+def test_waiting_threads_sleep_by_default(own):
     """The command sets the variables before it loads torch, which reads them on import."""
     program = (
         "import atexit, os, sys; sys.argv[1:] = ['--version']; "

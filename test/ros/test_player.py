@@ -83,7 +83,7 @@ def test_offset_duration_topics_and_remapping_take_effect(processes, peer, text_
     processes.check("bag_player")
 
 
-def test_a_latched_topic_reaches_a_late_subscriber(processes, peer, text_bag):
+def test_latched_topic_reaches_a_late_subscriber(processes, peer, text_bag):
     heard = peer.listen("/text", TEXT)
     start(processes, text_bag, start_paused=True)
     peer.wait(lambda: "playing" in peer.get_message("bag_player"), "the start")
@@ -146,7 +146,7 @@ def test_livox_and_compressed_clouds_are_played_as_point_clouds(start, tmp_path)
     assert (sent["draco"], texts(sent["text"]), player.diagnostics.counts["left_out"]) == ([], ["text"], 2)
 
 
-def test_bag_with_wrong_metadata_is_played_with_a_warning(start, text_bag, tmp_path, capfd):
+def test_bag_with_wrong_metadata_plays_with_a_warning(start, text_bag, tmp_path, capfd):
     from lidar_perception.nodes.replay.bag_player import BagPlayer
 
     shutil.copytree(text_bag, tmp_path / "bag")
@@ -163,7 +163,7 @@ def test_bag_with_wrong_metadata_is_played_with_a_warning(start, text_bag, tmp_p
     assert capfd.readouterr().err.count(warning) == 1
 
 
-def test_topic_of_several_publishers_offers_best_qos():
+def test_topic_of_several_publishers_offers_the_strictest_qos():
     from lidar_perception.nodes.replay.bag_player import _make_qos
 
     def profile(reliability, durability):
@@ -337,7 +337,7 @@ def test_recorder_writes_the_played_messages(processes, peer, text_bag, tmp_path
         assert {c.compression for c in make_reader(stream).get_summary().chunk_indexes} == {"lz4"}
 
 
-def test_looped_single_message_bag_is_not_played_in_a_busy_loop(monkeypatch, tmp_path):
+def test_looped_bag_of_one_message_does_not_busy_loop(monkeypatch, tmp_path):
     from lidar_perception.nodes.replay import bag_player
     from lidar_perception.params import PlayerParams
 

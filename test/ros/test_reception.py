@@ -62,7 +62,7 @@ def driver(peer, reliability, count, points=KITTI, first=1, hz=10):
     assert process.returncode == 0
 
 
-def test_clouds_of_drivers_with_other_qos_are_received(processes, peer):
+def test_clouds_are_received_with_any_reliability(processes, peer):
     """A RELIABLE driver loses nothing. A BEST_EFFORT driver loses little if the socket buffer holds a cloud, and
     losses are reported with a remedy. When it ends, the diagnostic is ERROR, then STALE."""
 
@@ -108,7 +108,7 @@ def test_clouds_of_drivers_with_other_qos_are_received(processes, peer):
     processes.check()
 
 
-def test_newest_cloud_is_used_and_dropped_ones_are_counted(processes, peer):
+def test_newest_cloud_is_processed_and_dropped_ones_counted(processes, peer):
     """A burst arrives while a node processes a large cloud. A second publisher is reported."""
     processes.start(NODE, {"~/input/points": "/in"}, {"ground.method": "patchwork"})
     talker, rng = peer.advertise("/in", CLOUD), np.random.default_rng(0)
@@ -198,7 +198,7 @@ def test_every_cloud_is_processed_or_counted_as_dropped():
         assert arrivals.learned == arrivals.measure_rate() == pytest.approx(10)
 
 
-def test_cloud_dropped_from_full_queue_is_not_lost():
+def test_cloud_dropped_from_full_queue_is_not_counted_lost():
     arrivals = Arrivals(5)
     arrivals.add(infos([1]), 0)
     arrivals.add(infos([8, 9, 10, 11, 12]), 4)
@@ -217,7 +217,7 @@ def test_restarted_or_second_driver_loses_no_cloud():
     assert (arrivals.lost, arrivals.dropped, arrivals.sent) == (1, 0, 8)
 
 
-def test_slower_sensor_is_detected_by_its_stamps():
+def test_lower_rate_of_a_sensor_is_measured_from_its_stamps():
     arrivals = Arrivals(5)
     for number in range(1, 30):
         arrivals.add(infos([number]), 0)
@@ -263,7 +263,7 @@ def test_middleware_queue_has_the_length_of_the_input_queue(start):
         assert reception.subscription.qos_profile.depth == reception.arrivals.depth == depth
 
 
-def test_unlatched_topic_error_names_the_remedy(peer, start):
+def test_publisher_without_latching_is_reported_with_remedy(peer, start):
     node = start(GroundSegmentation)
     node.inputs.subscribe("/static", TEXT, lambda _: None, LATCHED, private=False)
     peer.advertise("/static", TEXT, RELIABLE_QOS)
@@ -272,7 +272,7 @@ def test_unlatched_topic_error_names_the_remedy(peer, start):
     peer.wait(lambda: [executor.spin_once(0.0), "transient local" in node.diagnostics.state[1]][1], "the remedy")
 
 
-def test_source_of_losses_is_named_after_it_has_ended(start, monkeypatch):
+def test_lost_clouds_are_attributed_to_an_ended_driver(start, monkeypatch):
     (reception,) = start(GroundSegmentation, **{"input.max_lost": 0}).inputs.receptions
     driver = SimpleNamespace(
         node_namespace="/", node_name="driver", qos_profile=SimpleNamespace(reliability=BEST_EFFORT)
@@ -371,7 +371,7 @@ class Late:
         (10.0, 0.4, 2, 10, 2),
     ],
 )
-def test_slow_sensor_is_not_reported_silent(monkeypatch, given, learned, error, stale, lifetime):
+def test_slow_sensor_is_not_reported_as_silent(monkeypatch, given, learned, error, stale, lifetime):
     late = Late(monkeypatch, lambda stamp: 0.0, rate=given)
     late.reception.arrivals.learned, late.reception.last_time = learned, 1.0
     for late.now, kinds in (

@@ -70,7 +70,7 @@ def test_candidates_of_tilted_and_level_sensor_are_equal(start, tilt):
     np.testing.assert_allclose(tilted_one[:6], level[:6], atol=0.05)
 
 
-def test_seed_bank_keeps_the_last_clicks_and_skips_a_bad_one(start):
+def test_seed_bank_keeps_recent_clicks_and_skips_invalid_one(start):
     node = start(Perception, **WALKING, **{"seed.bank": 2})
     cloud = message(walker_scene()[:, :3])
 
@@ -138,7 +138,7 @@ def test_detections_of_tilted_and_level_sensor_are_equal(start, weights):
 
 
 @pytest.mark.parametrize("by", ["hand", "TF", "nothing"])
-def test_parameter_ahead_rotates_the_view_of_the_detectors(start, weights, by):
+def test_ahead_parameter_rotates_the_range_of_the_detectors(start, weights, by):
     """A rotated and tilted sensor gives the boxes of a level one, and points behind it are cropped."""
     scan, ahead = frame(), 150.0
     weights = {**weights, "crop.sectors": [100.0, 260.0]}

@@ -28,7 +28,7 @@ from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES
         ("~/input/points:=clustering/output/points", 8 << 20, "fastdds.xml"),
     ],
 )
-def test_driver_clouds_use_udp_if_the_socket_buffer_is_large(remap, buffer, profile, monkeypatch):
+def test_driver_clouds_use_udp_with_large_socket_buffer(remap, buffer, profile, monkeypatch):
     monkeypatch.setattr(shared_memory, "read_socket_buffer_size", lambda: buffer)
     monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=1 << 20, f_frsize=4096))
     for name in PROFILE_VARIABLES:

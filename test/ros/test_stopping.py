@@ -90,7 +90,7 @@ class Changing:
 
 
 @pytest.mark.parametrize("looks", [3, 10**9])
-def test_context_shuts_down_once_the_graph_has_settled(looks, monkeypatch):
+def test_context_shuts_down_after_the_graph_is_stable(looks, monkeypatch):
     pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
     from lidar_perception.nodes import external_node
     from lidar_perception.nodes.external_node import MAX_SETTLE_S, SETTLE_S, shut_down_context

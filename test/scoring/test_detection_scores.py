@@ -68,7 +68,7 @@ def concatenate(*lines):
 
 
 @pytest.mark.parametrize("seed, count, noise", [(0, 30, 0.12), (1, 60, 0.05), (2, 12, 0.1), (3, 20, 0.3), (4, 2, 0.1)])
-def test_scores_equal_an_independent_implementation(seed, count, noise):
+def test_scores_equal_those_of_an_independent_implementation(seed, count, noise):
     rng = np.random.default_rng(seed)
     frames = [reference.random_frame(rng, noise=noise) for _ in range(count)]
     compared = Comparison.concatenate(report(frames).frames)
@@ -88,7 +88,7 @@ def test_scores_equal_an_independent_implementation(seed, count, noise):
     assert few_objects and (many_objects or count < 150)
 
 
-def test_average_precision_of_four_objects_worked_out_by_hand():
+def test_average_precision_of_four_objects_is_exact():
     # Scores: 0.9 right, 0.8 wrong, 0.7 right, 0.6 wrong, 0.5 right; the fourth car is missed.
     # Recall 1/4, 2/4, 3/4 at precision 1, 2/3, 3/5.
     truth = concatenate(*(car(left=120 * i, x=6.0 * i) for i in range(4)))
@@ -218,7 +218,7 @@ def test_missing_label_fields_are_computed_from_the_box():
 
 @few
 @given(seeds)
-def test_labels_as_detections_score_100_everywhere(seed):
+def test_labels_as_detections_score_100(seed):
     rng = np.random.default_rng(seed)
     # Objects are far apart; overlapping labels could match the detection of their neighbour.
     truths = [
@@ -248,7 +248,7 @@ def test_labels_as_detections_score_100_everywhere(seed):
 
 @few
 @given(seeds)
-def test_the_order_of_detections_changes_nothing(seed):
+def test_order_of_detections_does_not_matter(seed):
     rng = np.random.default_rng(seed)
     frames, shuffled = [], []
     for _ in range(20):
@@ -262,7 +262,7 @@ def test_the_order_of_detections_changes_nothing(seed):
     assert report(frames).compute() == report(shuffled).compute()
 
 
-def test_the_order_of_equal_scores_changes_nothing():
+def test_order_of_equal_scores_does_not_matter():
     # Both detections match the first person, only one matches the second.
     truth = concatenate(*(car("Pedestrian", left=300 * i, x=1.6 * i) for i in range(2)))
     found = [car("Pedestrian", x=x, score=0.5) for x in (0.8, -0.8)]
@@ -272,7 +272,7 @@ def test_the_order_of_equal_scores_changes_nothing():
 
 @few
 @given(seeds)
-def test_a_wrong_detection_of_lower_score_never_raises_ap(seed):
+def test_weaker_false_positive_never_raises_ap(seed):
     rng = np.random.default_rng(seed)
     frames = [reference.random_frame(rng) for _ in range(20)]
     worse = [
@@ -297,7 +297,7 @@ def test_report_is_independent_of_batches_and_empty_frames():
     assert there == pytest.approx(back, abs=1e-9)
 
 
-def test_no_objects_or_frames_give_no_scores():
+def test_scores_without_objects_or_frames_are_missing():
     content = report([]).compute()
     assert content["frames"] == 0 and content["ap"] == {} and content["map_3d"] is None
     content = report([("", car(score=0.5))]).compute()
@@ -305,7 +305,7 @@ def test_no_objects_or_frames_give_no_scores():
     json.dumps(content, allow_nan=False)
 
 
-def test_a_detection_without_an_angle_has_no_orientation_score():
+def test_detection_without_angle_has_no_orientation_score():
     flat = "Car -1 -1 -10 500 150 600 210 -1 -1 -1 -1000 -1000 -1000 -10 0.9"  # a 2D detector
     rows = ap([(car(), flat)])["Car"]
     assert rows["image"]["easy"]["r40"] == 100 and rows["aos"]["easy"] is None
@@ -346,7 +346,7 @@ def test_error_about_non_finite_number_names_the_frame(broken):
         (0, 4.0, "0.00 m too high or too low, and 4.00 m too tall"),
     ],
 )
-def test_wrong_heights_are_diagnosed(shift, taller, words):
+def test_constant_height_error_is_reported(shift, taller, words):
     total = DetectionReport()
     truth = labels(concatenate(*(car(left=100 * i, x=5.0 * i - 10) for i in range(5))))
     found = Detections.of(truth.boxes + [0, 0, shift, 0, 0, taller, 0], 0, np.arange(5) / 5)
@@ -390,7 +390,7 @@ def test_detections_of_equal_score_share_a_threshold():
     assert scores.find_best_score() == 0.9
 
 
-def test_pedestrians_by_centre_distance_worked_out_by_hand():
+def test_ap_by_centre_distance_equals_hand_computed_value():
     total = DetectionReport()
     person = np.array([10.0, 0, -0.8, 0.8, 0.6, 1.7, 0])
     truth = GroundTruth.of([person, person + [0, 4, 0, 0, 0, 0, 0]], [PEDESTRIAN] * 2)

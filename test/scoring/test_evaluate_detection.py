@@ -96,7 +96,7 @@ def test_labels_as_results_score_100_and_are_printed(kitti, found, tmp_path, mon
     assert max(map(len, text.splitlines())) <= 80
 
 
-def test_short_bag_has_no_interval(kitti, detector, tmp_path):
+def test_single_second_of_a_drive_has_no_interval(kitti, detector, tmp_path):
     """One second of a drive is a single block, so there is nothing to resample."""
     detector.find = lambda frame: truth_of(kitti)
     write_bag(tmp_path / "bag", open_recording(kitti))
@@ -129,7 +129,7 @@ def test_scans_are_not_needed_for_result_files(kitti, found, tmp_path):
         open_recording(kitti)
 
 
-def test_a_checkpoint_is_run_on_every_scan(kitti, detector, tmp_path):
+def test_checkpoint_is_evaluated_on_every_scan(kitti, detector, tmp_path):
     detector.find = lambda frame: truth_of(kitti)
     content, text = evaluate(tmp_path, "--data", kitti, "--weights", "v4.onnx", "--device", "cpu")
     assert detector.asked == [("v4.onnx", "cpu", MIN_SCORE, SENSOR_HEIGHT)]
@@ -235,7 +235,7 @@ def test_frames_without_labels_are_written_and_not_scored(kitti, detector, tmp_p
     assert line == f"Error: {kitti}: no frame with labels"
 
 
-def test_truncated_scan_is_skipped_and_rejected_scan_missed(kitti, detector, tmp_path):
+def test_truncated_and_rejected_scans_are_listed_as_skipped(kitti, detector, tmp_path):
     write(kitti / "training/velodyne/000001.bin", b"123")
     content, text = evaluate(tmp_path, "--data", kitti, "--weights", "w")
     (line,) = content["skipped"]
@@ -357,7 +357,7 @@ def test_real_boxes_project_onto_their_2d_labels(data, detector, tmp_path):
         assert cell["r40"] > (80 if name == "Pedestrian" and row in ("image", "aos") else 99.99)
 
 
-def test_real_tracks_use_the_truncation_by_the_image_border(data, tmp_path):
+def test_real_tracks_use_truncation_at_the_image_border(data, tmp_path):
     root = data / "kitti_tracking"
     frames = open_recording(root).frames
     for frame in frames:

@@ -73,7 +73,7 @@ def by_stamp(root):
     return {frame.stamp_ns: frame for frame in open_nuscenes(root)}
 
 
-def test_a_checkpoint_is_run_and_its_results_score_the_same(root, detector, tmp_path, monkeypatch):
+def test_checkpoint_and_its_result_file_score_equally(root, detector, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     frames, out = by_stamp(root), tmp_path / "out/results.json"
     detector.find = lambda scan: detections(frames[scan.stamp_ns])
@@ -99,7 +99,7 @@ def test_a_checkpoint_is_run_and_its_results_score_the_same(root, detector, tmp_
     assert max(len(line) for line in text.splitlines() if str(out) not in line) <= 80
 
 
-def test_file_selects_the_scenes(root, tmp_path):
+def test_scenes_are_selected_by_a_file(root, tmp_path):
     scenes, path = tmp_path / "val.txt", tmp_path / "r.json"
     scenes.write_text("scene-0916\nscene-0916\n")
     write_results(path, {f.native.token: GlobalBoxes.none() for f in open_nuscenes(root)})
@@ -107,7 +107,7 @@ def test_file_selects_the_scenes(root, tmp_path):
     assert content["frames"] == 4 and content["all"]["map"] == content["all"]["nds"] == 0
 
 
-def test_result_file_round_trip(root, tmp_path):
+def test_result_file_survives_writing_and_reading(root, tmp_path):
     frames, rng = open_nuscenes(root), np.random.default_rng(0)
     written = {}
     for frame in frames:
@@ -155,7 +155,7 @@ def test_unreadable_and_rejected_scans_are_reported(root, detector, tmp_path):
     assert results[frames[2].native.token] == [] and frames[0].native.token not in results
 
 
-def test_a_version_without_labels_is_written_and_not_scored(tmp_path, detector, monkeypatch, capsys):
+def test_version_without_labels_is_written_and_not_scored(tmp_path, detector, monkeypatch, capsys):
     tables = {name: rows for name, rows in TABLES.items() if name != "sample_annotation"}
     root = tmp_path / "test"
     folder.save(root, TABLES)

@@ -64,7 +64,7 @@ def distances(found, truth, pairs):
 
 
 @given(seeds, small, small, st.sampled_from([0.3, 1.0, 5.0]))
-def test_matching_is_the_best_of_all_assignments(seed, found_count, truth_count, limit):
+def test_matching_equals_the_best_of_all_assignments(seed, found_count, truth_count, limit):
     rng = np.random.default_rng(seed)
     found, truth = some(rng, found_count), some(rng, truth_count)
     pairs = match_centres(found, truth, limit)
@@ -162,13 +162,13 @@ def test_scores_equal_hand_computed_values():
     assert table["30-45"]["centre_error_m"] is None
 
 
-def test_a_hit_belongs_to_the_range_of_the_true_object():
+def test_hit_counts_in_the_range_of_the_labelled_object():
     score = Score()
     score.update(boxes([15.2, 0, 0]), boxes([14.8, 0, 0]))
     assert score.make_rows()["0-15"]["tp"] == 1 and score.make_rows()["15-30"]["fp"] == 0
 
 
-def test_a_range_begins_at_its_lower_limit():
+def test_range_begins_at_its_lower_limit():
     at = boxes([0, 0, 9], [14.999, 0, 0], [0, 15, 0], [18, -24, 0], [45, 0, 0], [60, 0, 0], [1e4, 0, 0])
     assert [RANGE_NAMES[i] for i in find_range_bins(at)] == ["0-15", "0-15", "15-30", "30-45", "45-60", "60+", "60+"]
 
@@ -237,14 +237,14 @@ def test_report_is_json_and_counts_every_pedestrian():
     assert content["ms"]["total"] > 0
 
 
-def test_a_frame_without_a_seed_counts_its_pedestrians_as_missed():
+def test_pedestrians_of_a_frame_without_seed_are_missed():
     content, (found,) = run([frame("far", truth_of((30, 10, -0.8)))])
     assert found.problem and found.boxes and not any(map(len, found.boxes.values()))
     assert content["frames"] == 1 and content["final"]["all"]["fn"] == 1
     assert content["skipped"][0].startswith("far: ")
 
 
-def test_an_empty_recording_has_an_empty_report():
+def test_empty_recording_has_an_empty_report():
     content, _ = run([])
     assert content["frames"] == content["ground_truth"] == 0
     assert json.loads(json.dumps(content, allow_nan=False)) == content

@@ -63,20 +63,20 @@ def test_perfect_detections_score_1():
     assert summarize({"car": s})["nds"] == pytest.approx(1)
 
 
-def test_best_nds_without_velocities_and_attributes_is_0_8():
+def test_max_nds_without_velocity_and_attributes_is_0_8():
     s = scored(boxes(*ROW, velocities=1.0, attributes=6), boxes(*ROW, scores=0.5))
     assert (s.errors["ave"], s.errors["aae"]) == (1, 1)
     assert summarize({"car": s})["nds"] == pytest.approx(0.8)
 
 
-def test_one_of_four_is_recall_0_25():
+def test_one_of_four_objects_gives_recall_0_25():
     """The first 15 of the 90 recalls above 0.1 are reached, with precision 1."""
     s = scored(boxes(*ROW[:4]), boxes((10.3, 0.4), scores=0.7))
     assert s.ap == pytest.approx({0.5: 0, 1.0: 15 / 90, 2.0: 15 / 90, 4.0: 15 / 90})
     assert s.errors["ate"] == pytest.approx(0.5)
 
 
-def test_recall_up_to_0_1_counts_nothing():
+def test_ap_ignores_recall_up_to_0_1():
     s = scored(boxes(*ROW), boxes(ROW[0], ROW[1], scores=[0.9, 0.8]))
     assert s.mean_ap == 0 and set(s.errors.values()) == {1.0}
 
@@ -88,12 +88,12 @@ def test_false_positive_of_higher_score_lowers_precision():
     assert s.mean_ap == pytest.approx(0.2)
 
 
-def test_a_hit_is_nearer_than_the_distance():
+def test_hit_must_be_closer_than_the_distance():
     s = scored(boxes(*ROW), boxes(*[(x, 1.0) for x, _ in ROW], scores=0.5))
     assert s.ap == pytest.approx({0.5: 0, 1.0: 0, 2.0: 1, 4.0: 1})
 
 
-def test_object_matches_once_with_the_better_score():
+def test_object_is_matched_once_to_the_better_score():
     """The second detection is a false positive, so precision at recall 1 is 0.5."""
     truth = boxes((0, 0))
     for first, other in ((0.2, 0.0), (0.0, 0.2)):
@@ -136,7 +136,7 @@ def test_errors_of_a_match_equal_hand_computed_values():
     assert np.isnan(compute_errors(boxes((0, 0)), found, False)["aae"])
 
 
-def test_error_is_a_mean_of_means_over_recall():
+def test_error_is_averaged_over_recall_levels():
     """Two objects have errors 0 and 1, in order of score. The error is 0 at recalls 0.11 to 0.5 and rises in 50
     steps to the mean of both, 0.5, at recall 1."""
     s = scored(boxes((0, 0), (20, 0)), boxes((0, 0), (21, 0), scores=[0.9, 0.8]))
@@ -144,7 +144,7 @@ def test_error_is_a_mean_of_means_over_recall():
 
 
 @pytest.mark.parametrize("kind", NAMES)
-def test_a_class_counts_within_its_range_of_the_vehicle(kind):
+def test_objects_beyond_the_range_of_their_class_do_not_count(kind):
     there = np.array([100.0, 50.0])
     away = RANGES[kind]
     kept = select_scored_boxes(
@@ -197,7 +197,7 @@ def close_to_reference(content, by_class, over):
     "seed, frames, objects, noise", [(0, 2, 20, 0.1), (1, 3, 60, 0.4), (2, 5, 150, 0.4), (3, 4, 90, 1.0)]
 )
 @pytest.mark.no_cover
-def test_scores_equal_an_independent_implementation(tmp_path, seed, frames, objects, noise):
+def test_scores_equal_those_of_an_independent_implementation(tmp_path, seed, frames, objects, noise):
     tables = folder.make_tables(seed, frames, objects)
     results = folder.make_results(tables, CATEGORIES, seed + 10, noise)
     by_class, over = reference.evaluate(tables, results, CATEGORIES)
@@ -244,7 +244,7 @@ def test_scores_equal_the_nuscenes_devkit(tmp_path, seed, ties):
         )
 
 
-def test_rotating_and_shifting_the_world_changes_nothing(tmp_path):
+def test_scores_do_not_depend_on_the_global_frame(tmp_path):
     results = folder.make_results(TABLES, CATEGORIES)
     before = reported(folder.save(tmp_path / "a", TABLES, sweeps=False), results)
     tables, turn = copy.deepcopy(TABLES), folder.Rotation.from_euler("z", 1.1)

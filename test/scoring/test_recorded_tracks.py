@@ -54,7 +54,7 @@ def recorded(request, tmp_path):
     return tmp_path / "bag", request.param, message
 
 
-def test_recorded_tracks_are_scored_if_labels_have_ids(recorded):
+def test_recorded_tracks_need_labels_with_ids(recorded):
     path, with_ids, _ = recorded
     frames = read_results(path, TRACKS)[0]
     assert count_recorded_tracks(frames) == {"Car": 2, "Cyclist": 1, "Pedestrian": 3}

@@ -57,7 +57,7 @@ def root(tmp_path):
     return root
 
 
-def test_results_are_equal_and_ordered_with_many_processes(root):
+def test_results_do_not_depend_on_number_of_processes(root):
     recording = open_recording(root)
     one, two = ([*measure_frames(recording, counting, jobs=jobs)] for jobs in (1, 2))
     kinds = [type(result) for _, result in one]
@@ -86,7 +86,7 @@ def test_unreadable_frame_is_skipped_by_name(root, jobs):
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_run_error_ends_the_run_and_keeps_earlier_results(root, jobs):
+def test_fatal_error_keeps_earlier_results(root, jobs):
     report = Names()
     with pytest.raises(InputError, match=r"^cannot go on after 000002$"):
         fill_report(report, open_recording(root), functools.partial(ending, "000002"), jobs=jobs)
@@ -139,7 +139,7 @@ def test_limit_reads_no_other_frames(root, limit, expected):
     assert touched == [f"00000{i}" for i in range(min(limit or COUNT, COUNT))]
 
 
-def test_setup_and_measurements_run_once_and_lazily(root):
+def test_setup_and_measurements_run_lazily_and_once(root):
     called = []
 
     def start(recording):
@@ -159,7 +159,7 @@ def test_recording_without_reopen_needs_one_process(root):
 
 
 @given(st.sets(st.integers(0, 20)), st.randoms(use_true_random=False))
-def test_results_are_sorted_and_yielded_early(numbers, random):
+def test_results_are_yielded_in_order_as_soon_as_possible(numbers, random):
     numbers = sorted(numbers)
     sent, taken = random.sample(numbers, len(numbers)), []
 

@@ -95,7 +95,7 @@ def test_two_objects_in_one_cluster_are_both_under_segmented():
     assert content["under_segmentation"] == pytest.approx(2 / 3)
 
 
-def test_half_and_merged_objects_are_no_hits():
+def test_split_and_merged_objects_are_not_hits():
     halves = report_of(np.repeat([1, 2], 20), objects(np.ones(40)))
     assert (halves["over_segmented"], halves["mean_pieces"], halves["under_segmented"]) == (1, 2, 0)
     both = report_of(np.ones(40), objects(np.repeat([1, 2], 20)))
@@ -104,7 +104,7 @@ def test_half_and_merged_objects_are_no_hits():
         assert (content["mean_iou"], content["hits"], content["f1"]) == (0.5, 0, 0)
 
 
-def test_fragments_need_a_tenth_of_the_object():
+def test_fragment_counts_from_a_tenth_of_the_object():
     for small, pieces in ((9, 1), (10, 2)):
         score = score_clusters(np.repeat([3, 1], [100 - small, small]), objects(np.ones(100)))
         assert score.pieces.tolist() == [pieces]
@@ -146,7 +146,7 @@ def test_clusters_of_ignored_points_are_not_scored(counted):
 
 
 @given(seeds)
-def test_order_of_points_and_numbers_of_clusters_do_not_matter(seed):
+def test_order_of_points_and_cluster_ids_do_not_matter(seed):
     found, truth = some(seed)
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(found))
@@ -180,7 +180,7 @@ def test_scores_equal_a_plain_loop_over_sets(seed):
     assert score.judged_count >= np.sum(score.iou > 0.5)  # so that ratios are at most 1
 
 
-def test_no_clusters_or_no_objects_have_scores():
+def test_scores_are_defined_without_clusters_or_objects():
     nothing = report_of(np.zeros(20), objects(np.ones(20)))
     assert (nothing["recall"], nothing["precision"], nothing["mean_iou"]) == (0, 0, 0)
     for found in (np.zeros(20), np.ones(20), np.zeros(0)):
@@ -211,7 +211,7 @@ def test_low_points_are_neutral_and_small_objects_ignored():
     assert found.is_counted.all() and found.classes == ("Van",) and found.ranges.tolist() == [10]
 
 
-def test_a_point_in_two_boxes_belongs_to_the_smaller():
+def test_point_in_two_boxes_belongs_to_the_smaller_one():
     xyz = np.concatenate([column(10, 0, (-1, 0), 20), column(12, 0, (-1, 0), 30)])
     boxes = [[10, 0, 0, 1, 1, 4, 0], [11, 0, 0, 5, 3, 4, 0]]
     for order in ([0, 1], [1, 0]):
@@ -308,7 +308,7 @@ def semantic_folder(root, scans=("00/000000", "00/000001", "05/000000")):
     return root
 
 
-def test_a_folder_is_read_in_order_without_unusable_returns(tmp_path):
+def test_folder_is_read_in_order_without_unusable_returns(tmp_path):
     semantic_folder(tmp_path / "dataset")
     write(tmp_path / "dataset/sequences/11/velodyne/000000.bin", b"")  # a test sequence
     frames = open_recording(tmp_path).frames

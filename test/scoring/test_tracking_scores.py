@@ -89,7 +89,7 @@ def test_fast_scores_equal_a_slow_implementation(seed):
     )
 
 
-def test_renaming_ids_changes_nothing():
+def test_scores_do_not_depend_on_track_ids():
     sequences = random_sequences(7)
     renamed = [
         [replace(f, track_ids=1000 - f.track_ids, true_ids=f.true_ids * 7 + 3) for f in frames] for frames in sequences
@@ -116,7 +116,7 @@ def scored(frames, similarity="3d", order=None, calibration=None):
     return report.compute()["classes"]["Car"]
 
 
-def test_tracks_that_are_the_labels_score_one():
+def test_labels_as_tracks_score_one():
     score = scored(drive())
     for name in ("HOTA", "DetA", "AssA", "MOTA", "MOTP"):
         assert score[name] == pytest.approx(1.0, abs=1e-5)
@@ -124,7 +124,7 @@ def test_tracks_that_are_the_labels_score_one():
     assert score["sAMOTA"] == pytest.approx(score["AMOTP"], abs=1e-5)
 
 
-def test_swapped_ids_are_two_switches():
+def test_swapped_ids_count_as_two_switches():
     score = scored(drive(switch_at=5))
     assert score["switches"] == 2 and score["DetA"] == pytest.approx(1.0)
     assert score["AssA"] == pytest.approx(1 / 3)  # each pair: 5 / (10 + 10 - 5)
@@ -202,7 +202,7 @@ def test_neighbour_classes_and_truncated_labels_are_ignored():
     assert scored(behind)["misses"] == 2 * scored(behind)["false"] == 20
 
 
-def test_a_track_in_a_dont_care_region_is_excused():
+def test_track_in_dont_care_region_is_not_a_false_positive():
     ((_, tracks),) = drive(frames=1)
     wide = GroundTruth.of(
         [],
@@ -229,7 +229,7 @@ def test_a_track_in_a_dont_care_region_is_excused():
     assert scored([(nothing, tracks)], calibration=FORWARD_CAMERA)["false"] == 2
 
 
-def test_no_tracks_are_misses_and_no_labels_false_positives():
+def test_empty_tracks_or_labels_count_as_errors():
     nothing = GroundTruth.of([], [])
     missed = scored([(truth, nothing) for truth, _ in drive()])
     assert (missed["misses"], missed["HOTA"], missed["sAMOTA"]) == (20, 0.0, 0.0)
@@ -255,7 +255,7 @@ def test_error_explains_why_tracks_cannot_be_scored():
         make_pairs(truth, tracks, None, "image")
 
 
-def test_result_file_round_trip(tmp_path):
+def test_result_file_survives_writing_and_reading(tmp_path):
     frames = [
         (i, np.array([4, 9]), Detections.of(tracks.boxes, [CAR, 4], [0.25, 0.75]))
         for i, (_, tracks) in enumerate(drive(frames=3))

@@ -61,7 +61,7 @@ def test_tilted_sensor_is_measured_correctly(name):
         assert m.timing.rate == pytest.approx(sensor.rate, rel=0.01)
 
 
-def test_sensor_file_is_the_measured_sensor(tmp_path):
+def test_sensor_file_describes_the_measured_sensor(tmp_path):
     for name in CHECKED:
         path = tmp_path / f"{name}.yaml"
         path.write_text(format_sensor(measure(name)))
@@ -72,7 +72,7 @@ def test_sensor_file_is_the_measured_sensor(tmp_path):
         assert sensor.min_range == known.min_range  # not the distance of the nearest ground
 
 
-def test_slice_of_wall_is_not_ground_of_upside_down_sensor():
+def test_horizontal_slice_of_a_wall_is_not_taken_for_ground():
     rng = np.random.default_rng(0)
     ground = rng.uniform([-25, -25, 1.71], [25, 25, 1.75], (20000, 3))
     wall = rng.uniform([4, -3, -0.28], [9, 3, -0.24], (150, 3))
@@ -110,14 +110,14 @@ def test_model_is_recognised_by_its_beams(name):
         assert not find_matching_model(beams._replace(elevations=np.linspace(half, -half, rows)))
 
 
-def test_height_hint_counts_without_ground():
+def test_height_hint_is_used_without_ground():
     m = measure("vlp-16")
     m = replace(m, mounting=m.mounting._replace(mount=None, heading=None, height_hint=0.7))
     assert "height: 0.7  # from --height-hint" in format_sensor(m)
     assert "height: 0.7" in format_params(m)
 
 
-def test_beams_by_ring_and_by_elevation_agree():
+def test_beams_from_rings_and_from_elevations_agree():
     with_rings = scans("vlp-16")
     by_ring, by_elevation = (find_beams(s) for s in (with_rings, [scan._replace(ring=None) for scan in with_rings]))
     assert (by_ring.method, by_elevation.method) == ("ring", "elevation")

@@ -94,14 +94,14 @@ def test_odometry_of_sensor_shows_its_heading():
     assert heading.degrees == pytest.approx(-30, abs=1) and not heading.from_base
 
 
-def test_partial_odometry_does_not_mean_standing_still():
+def test_single_pose_does_not_mean_a_stationary_robot():
     _, poses = drive()
     m = measure_drive(RecordedPoses("base_link", poses={COUNT - 1: poses[-1]}))
     assert m.view.coverage.stationary is False
     assert not any("stands still" in line for line in find_warnings(m))
 
 
-def test_error_of_heading_has_lower_limit_in_one_place():
+def test_heading_error_is_at_least_7_degrees_from_one_place():
     heading = estimate_heading({(i, i + 1): np.array([1.0, 0.25]) for i in range(40)}, {})
     assert heading.error >= 7 and not heading.is_off_axis
 
@@ -113,7 +113,7 @@ def test_shifts_need_poses_and_straight_motion():
     assert steps == {(0, 1): (0, 0), (0, 2): None}
 
 
-def test_contradictions_of_tf_and_clouds_are_reported():
+def test_contradiction_between_tf_and_clouds_is_reported():
     _, poses = drive()
     m = measure_drive(RecordedPoses())
     mount = m.mounting.mount

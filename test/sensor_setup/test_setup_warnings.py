@@ -158,7 +158,7 @@ def make_scan(xyz):
 
 
 @pytest.mark.parametrize("half", [0.8, 1.1, 2.0])
-def test_walls_along_path_are_not_body(half):
+def test_walls_along_the_path_are_not_robot_body(half):
     m = measure(list(simulate_scans(half)), range(8))
     c = m.view.coverage
     assert c.stationary is False and c.has_walls and not c.can_crop and not c.blocked
@@ -168,7 +168,7 @@ def test_walls_along_path_are_not_body(half):
     assert c.box[0] == pytest.approx(-1.55, abs=0.05)
 
 
-def test_robot_stands_still_while_people_pass():
+def test_passing_people_do_not_mean_robot_motion():
     around = np.random.default_rng(0).uniform(5, 50, (16, 360))
     passed = np.array([np.where(np.arange(360) // 36 == i, 4.5, around) for i in range(10)])
     assert is_stationary(passed)
@@ -204,7 +204,7 @@ def test_poses_show_motion_on_uniform_ground():
         assert not warns(m, "cannot tell whether the robot moved")
 
 
-def test_clouds_in_ground_frame_are_recognised():
+def test_clouds_in_a_ground_frame_are_recognised():
     scans = [make_scan(s.xyz + [0, 0, 0.6]) for s in simulate_scans()]
     assert measure_mount(scans) is None and is_on_ground(scans)
     assert not is_on_ground(list(simulate_scans()))
@@ -280,7 +280,7 @@ DRIVES = {
 
 
 @pytest.mark.parametrize("name", DRIVES)
-def test_heading_is_measured_at_any_speed(name):
+def test_heading_is_measured_at_low_and_high_speed(name):
     seed, scene, speed, count, angles = DRIVES[name]
     sensor = replace(find_sensor("vlp-16"), height=0.6)
     frames = list(simulate_frames(seed, count, sensor, 40, Scenes(scene=scene)))
@@ -387,7 +387,7 @@ def test_intensity_scale_is_measured(values, full, sure):
     assert measure_intensity([scan._replace(intensity=np.zeros(9))]) is None
 
 
-def test_integer_scale_uses_all_scans():
+def test_integer_intensity_scale_uses_all_scans():
     scan = change_scans(None)[0]
     dark = replace_intensity(scan, np.zeros(20_000))
     assert not measure_intensity([dark, replace_intensity(scan, np.linspace(0, 0.9, 9_000))]).is_integer
@@ -400,7 +400,7 @@ def replace_intensity(scan, values):
     return scan._replace(intensity=values)
 
 
-def test_measurement_does_not_change_scans():
+def test_measurement_does_not_modify_scans():
     scans = change_scans(None)
     before = [scan.xyz.copy() for scan in scans]
     m = measure(scans)

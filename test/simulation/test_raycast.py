@@ -58,7 +58,7 @@ def are_equal(one, other):
 
 @pytest.mark.parametrize("motion", [NO_MOTION, DRIVE])
 @pytest.mark.parametrize("seed", range(4))
-def test_hits_equal_brute_force_reference(seed, motion):
+def test_hits_equal_brute_force(seed, motion):
     objects = make_crowd(seed)
     for sensor in (SENSOR, replace(SENSOR, lifts=(), elevations=tuple(np.linspace(1.4, -1.4, 9)))):
         hits = cast_rays(objects, Ground(), NO_GROUND, sensor, motion)
@@ -89,7 +89,7 @@ def test_hits_depend_on_seed_only():
 
 
 @pytest.mark.parametrize("motion", [NO_MOTION, DRIVE])
-def test_nearest_of_single_casts_equals_joint_cast(motion):
+def test_joint_cast_gives_the_nearest_of_single_casts(motion):
     """Cast overlapping solids in high grass, most without an owner. Neither order nor skipping changes the
     result."""
     count, rng = 160, np.random.default_rng(0)
@@ -138,7 +138,7 @@ def even_leaves(monkeypatch):
     monkeypatch.setattr(foliage, "LEAF_FRACTION", 1.0)
 
 
-def test_leaf_clumps_are_constant_during_drive():
+def test_leaf_clumps_do_not_change_during_a_drive():
     """Two casts with different random numbers hit leaves in the same cells, a fraction LEAF_FRACTION of all."""
     fine = make_generic_sensor(64, -8.0, 8.0, 0.1, 10.0, divergence=0.0)
     plant = make_solids(BOX, (12, 0, 0), (3, 3, 3), density=2.0)
@@ -174,7 +174,7 @@ def test_foliage_stops_rays_after_mean_free_path(kind, even_leaves):
     assert thick.unoccluded_counts[1] == np.isfinite(thick.range).sum() < thin.unoccluded_counts[1]
 
 
-def test_rays_from_inside_are_stopped_only_by_foliage(even_leaves):
+def test_ray_from_inside_a_solid_hits_only_foliage(even_leaves):
     inside = [
         cast_rays(make_solids(ELLIPSOID, (0.5, 0, 0), (4, 4, 4), density=density), Ground(), NO_GROUND, SENSOR).range
         for density in (np.inf, 1.0)
@@ -203,7 +203,7 @@ def test_nearest_solid_is_hit_and_occluded_rays_are_counted():
     assert hit_counts[1] == hits.unoccluded_counts[1] and hit_counts[2] < 0.4 * hits.unoccluded_counts[2]
 
 
-def test_beam_on_an_edge_returns_one_side_or_a_range_between():
+def test_beam_on_an_edge_returns_either_surface_or_a_mixture():
     near, far = (BOX, (5, 0, 0), (0.2, 1, 1)), (BOX, (5.7, 0, 0), (0.2, 9, 4))
     objects = make_solids(*zip(near, far), [1, 2])
     fine = make_generic_sensor(64, -10.0, 10.0, 0.2, 10.0, divergence=3e-3)

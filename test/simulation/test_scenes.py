@@ -48,7 +48,7 @@ def transform_points(xyz, pose):
         (Scenes("zone", 3.0), 5, 60, 2529, 45604.297402, 803.007722902),
     ],
 )
-def test_seed_gives_known_scene(scenes, seed, moment, points, metres, labels):
+def test_seed_always_gives_the_same_scene(scenes, seed, moment, points, metres, labels):
     """Update the expected values after intended changes of the scenes."""
     scan = simulate_scan(seed, moment, TINY, scenes)
     assert len(scan.frame) == points
@@ -89,7 +89,7 @@ def test_actors_never_touch_robot_or_each_other(scene, kind):
 
 
 @pytest.mark.parametrize("scene, kind", ROBOTS)
-def test_points_and_boxes_agree_with_world(scene, kind):
+def test_points_and_boxes_agree_with_the_scene(scene, kind):
     """For any heading and yaw rate, the ground agrees with the world and points of labelled objects are in their
     boxes."""
     simulated = make_cached_scene(scene, kind)
@@ -135,7 +135,7 @@ def test_mixture_alternates_between_kinds_of_scenes():
 
 
 @pytest.mark.parametrize("kind", SCENE_TYPES["indoor"].kinds)
-def test_setup_finds_the_height_indoors(kind):
+def test_setup_measures_the_sensor_height_indoors(kind):
     sensor = replace(find_sensor("vlp-16", 0.6), azimuth_step=float(np.radians(0.8)))
     frames = [simulate_scan(7, i, sensor, Scenes(kind, 1.0, "indoor")).frame for i in (0, 1, 90, 91)]
     clouds = [
@@ -218,7 +218,7 @@ def test_unknown_scene_raises_input_error(scenes, message):
         next(simulate_frames(0, 1, TINY, 1, scenes))
 
 
-def test_wandering_beams_differ_between_scenes():
+def test_beam_wander_differs_between_scenes():
     sensor, elevations = replace(EXACT, wander=np.radians(2.0)), []
     for seed in range(3):
         scan = simulate_scan(seed, 0, sensor, Scenes(scene="campus"))

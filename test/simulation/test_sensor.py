@@ -61,7 +61,7 @@ def test_presets_have_plausible_values(name):
     assert len(np.unique(times)) == sensor.columns
 
 
-def test_hdl64e_agrees_with_kitti():
+def test_hdl_64e_preset_matches_kitti():
     assert (HDL64E.height, HDL64E.columns, HDL64E.rate) == (1.73, 2140, 10.0)
     assert abs(np.degrees(HDL64E.azimuth_step) - 0.168) < 1e-3
 
@@ -112,7 +112,7 @@ def test_sensor_names_are_accepted_in_any_spelling():
     assert find_sensor("hdl64e") == find_sensor("HDL-64E") == HDL64E
 
 
-def test_file_in_degrees_gives_sensor_in_radians(tmp_path):
+def test_angles_of_a_sensor_file_are_in_degrees(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(
         "name: mine\nelevations: [4, 0, -10.5]\nazimuth_step: 0.5\nrate: 10\n"
@@ -165,7 +165,7 @@ def test_error_names_the_bad_sensor_file_and_the_reason(tmp_path, text, message)
     assert str(path) in str(error.value) and "\n" not in str(error.value)
 
 
-def test_shifts_of_wandering_beams_are_evenly_distributed():
+def test_beam_wander_is_uniformly_distributed():
     sensor = replace(SMALL, wander=np.radians(2.0))
     sensors = [sensor.shift_beams(i) for i in range(50)]
     shifts = np.sort([sensor.elevations[3] - shifted.elevations[3] for shifted in sensors])
@@ -211,7 +211,7 @@ def test_returns_have_documented_properties():
     assert (np.diff(bearing)[np.diff(returns.ring) == 0] > -1e-5).all()
 
 
-def test_ring_gives_elevation_and_time_gives_azimuth():
+def test_ring_matches_elevation_and_time_matches_azimuth():
     returns = make_measurement(SMALL, 30.0)
     rise = returns.xyz[:, 2] / np.linalg.norm(returns.xyz, axis=1)
     assert np.allclose(np.arcsin(rise), np.array(SMALL.elevations)[returns.ring], atol=1e-5)
@@ -252,7 +252,7 @@ def test_far_and_dark_returns_are_lost():
     assert abs(lost - 0.2) < 0.03
 
 
-def test_infinite_reach_loses_only_rays_without_hit():
+def test_infinite_reach_keeps_every_hit():
     sensor = replace(SMALL, reach=np.inf, dropout=0.0)
     distance = np.where(np.arange(sensor.columns) % 2, np.inf, 100.0)[:, None]
     with warnings.catch_warnings():
@@ -261,7 +261,7 @@ def test_infinite_reach_loses_only_rays_without_hit():
     assert len(returns.xyz) == sensor.columns * sensor.rings / 2
 
 
-def test_intensity_is_brightness_with_bias_and_fade():
+def test_intensity_follows_brightness_bias_and_fade():
     plain = make_measurement(SMALL, 10.0, 0.4)
     assert abs(plain.intensity.mean() - 0.4) < 0.005
     faded = make_measurement(replace(SMALL, fade=(18.0, 0.01)), 28.0, 0.4)

@@ -121,7 +121,7 @@ def test_killed_command_leaves_no_process_and_resumes(start, tmp_path):
     assert len(list(out.glob("training/label_02/*.txt"))) == 2
 
 
-def test_data_set_is_locked_and_ctrl_c_ends_all_processes(start, tmp_path):
+def test_data_set_is_locked_until_ctrl_c_ends_all_processes(start, tmp_path):
     process = start(tmp_path / "set", 100_000)
     for more in (["--resume"], ["--force"], []):
         with pytest.raises(InputError, match="another process"):

@@ -52,7 +52,7 @@ def test_columns_of_scan_agree_with_points():
         assert points_in_box(xyz[on_object], box, margin=1.0).all()  # moving parts, mirrors, umbrellas
 
 
-def test_object_layout_reads_back(made):
+def test_object_layout_is_read_as_written(made):
     recording = open_recording(made / "kitti")
     assert len(recording) == 5
     for number, recorded in enumerate(recording):
@@ -79,7 +79,7 @@ def test_hidden_objects_become_dont_care():
     assert [e["bbox"] for e in left_out] == [note["bbox"] for _, note in labels.notes]
 
 
-def test_tracking_layout_reads_back(made):
+def test_tracking_layout_is_read_as_written(made):
     frames = open_recording(made / "kitti-tracking").frames
     assert [f.name for f in frames] == ["0000/000000", "0000/000001", "0001/000000", "0001/000001", "0002/000000"]
     for number, recorded in enumerate(open_recording(made / "kitti-tracking")):
@@ -106,7 +106,7 @@ def assert_same_objects(actual, expected, accuracy, truncation=None):
         assert np.allclose(a["bbox"], b["bbox"], atol=accuracy)
 
 
-def test_semantickitti_layout_reads_back(made):
+def test_semantickitti_layout_is_read_as_written(made):
     root = made / "semantickitti"
     frames = open_recording(root).frames
     assert [f.name for f in frames] == ["00/000000", "00/000001", "01/000000", "01/000001", "02/000000"]
@@ -162,7 +162,7 @@ def test_bag_contains_consecutive_streets(tmp_path):
     assert np.diff(stamps).tolist() == [10**8, 101 * 10**8, 10**8]
 
 
-def test_2d_boxes_contain_projected_corners():
+def test_image_boxes_contain_projected_corners():
     rng = np.random.default_rng(0)
     boxes = np.column_stack(
         [
@@ -197,7 +197,7 @@ def test_2d_boxes_contain_projected_corners():
         assert (uv >= limits[:2] - 1e-6).all() and (uv <= limits[2:] + 1e-6).all()
 
 
-def test_2d_boxes_agree_with_real_labels(data):
+def test_image_boxes_agree_with_real_labels(data):
     worst, errors = [], []
     for frame in open_recording(data / "kitti_object"):
         truth = frame.truth()
@@ -208,7 +208,7 @@ def test_2d_boxes_agree_with_real_labels(data):
     assert np.median(worst) < 0.5 and np.max(errors) < 0.07
 
 
-def test_labels_without_objects_read_back(tmp_path):
+def test_labels_without_objects_are_read_as_written(tmp_path):
     empty = simulate_scan(3, 0, TINY).truth
     empty = type(empty).of([], [])
     write_kitti.write_object(tmp_path, 0, np.zeros((0, 4)), empty, FORWARD_CAMERA)

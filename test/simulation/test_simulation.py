@@ -102,7 +102,7 @@ def test_boxes_stand_on_ground_without_overlap(seed):
             assert not points_in_box(np.delete(corners_and_centres, i, axis=0).reshape(-1, 3), box).any()
 
 
-def test_pedestrians_are_always_in_view():
+def test_each_frame_has_visible_pedestrians():
     for scan in simulate_drive(33, 11, replace(COARSE, rate=2.5), CROWDED_ZONES):
         boxes = scan.truth.select_class(PEDESTRIAN)
         distance, bearing = np.hypot(boxes[:, 0], boxes[:, 1]), np.arctan2(boxes[:, 1], boxes[:, 0])

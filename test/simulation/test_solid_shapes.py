@@ -131,7 +131,7 @@ def test_box_contains_pedestrian_during_the_entire_stride(name):
             assert abs(high[:, 0].max() - obj.size[0] / 2) < 0.01
 
 
-def test_foot_on_ground_does_not_slide():
+def test_foot_on_the_ground_does_not_slide():
     for seed in SEEDS:
         obj = people.make_pedestrian(np.random.default_rng(seed), 1.3)
         distances = np.linspace(0, find_stride(obj), 401)
@@ -223,7 +223,7 @@ def scan_object(obj, distance, yaw, seed):
     return xyz + np.array([0.0, 0.0, 1.73])
 
 
-def test_fraction_of_low_points_of_cyclist_agrees_with_kitti():
+def test_fraction_of_low_cyclist_points_matches_kitti():
     """46 % of the points of 10 KITTI cyclists are below 0.42 of their height."""
     fractions = []
     for seed in SEEDS:
@@ -234,7 +234,7 @@ def test_fraction_of_low_points_of_cyclist_agrees_with_kitti():
 
 
 @pytest.mark.parametrize("distance, low, high", [(20.0, 0.22, 0.32), (33.0, 0.20, 0.32), (48.0, 0.08, 0.25)])
-def test_fraction_of_points_above_car_windows_falls_with_range(distance, low, high):
+def test_points_seen_through_car_windows_decrease_with_range(distance, low, high):
     """In KITTI, 38, 31 and 16 % of the points are above 0.65 of the height for 22, 17 and 15 cars seen from
     behind at 12 to 25, 25 to 40 and 40 to 70 m. Their lower parts are often occluded."""
     fractions = []
@@ -256,7 +256,7 @@ def scan_cars_from_front():
 @pytest.mark.parametrize(
     "zone, low, high", [((0.15, 0.35), 0.04, 0.10), ((0.35, 0.55), 0.12, 0.24), ((0.55, 0.65), 0.45, 0.75)]
 )
-def test_only_the_bumper_touches_the_front_of_the_box(zone, low, high):
+def test_only_the_bumper_reaches_the_front_of_the_box(zone, low, high):
     """In three height zones of KITTI cars seen from the front (medians of 42 to 59 cars), a quarter of the points
     are within 0.07, 0.17 and 0.60 m of the front of the box."""
     depths = []
@@ -270,14 +270,14 @@ def test_only_the_bumper_touches_the_front_of_the_box(zone, low, high):
 
 
 @pytest.mark.parametrize("length", [3.2, 3.8, 4.5])
-def test_short_and_long_cars_have_the_same_seats(length):
+def test_car_length_does_not_change_the_seats(length):
     parts = vehicles.make_body((length, 1.65, 1.5), vehicles.HATCHBACK, 0.3, 0.8, driver=False)
     seats = parts[np.isclose(parts["transmission"], 0.75)]
     assert len(seats) == 2 and np.ptp(seats["centre"][:, 0]) > 0.4
 
 
 @pytest.mark.parametrize("label", SIZES)
-def test_sizes_have_the_deviation_of_the_table(label):
+def test_drawn_sizes_follow_the_size_table(label):
     rng = np.random.default_rng(0)
     sizes = np.array([draw_size(rng, label) for _ in range(4000)])
     mean, spread, correlation = SIZES[label]
@@ -307,7 +307,7 @@ def test_size_table_agrees_with_labels(data):
 
 
 @pytest.mark.parametrize("name", SCENERY)
-def test_scenery_reaches_the_ground(name):
+def test_scenery_stands_on_the_ground(name):
     make, _ = SCENERY[name]
     for seed in SEEDS:
         low, high = find_extents(draw_parts(make, seed))

@@ -67,7 +67,7 @@ def test_objects_stand_on_ground(kind, seed):
 
 
 @pytest.mark.parametrize("kind, seed", STREETS)
-def test_boxes_move_with_their_speed(kind, seed):
+def test_boxes_move_at_their_speed(kind, seed):
     scene, dt = make_cached_scene(kind, seed), 0.5
     for t in (0.0, 9.0):
         one, two = scene.compute_state(t, HEIGHT), scene.compute_state(t + dt, HEIGHT)
@@ -89,7 +89,7 @@ def test_boxes_move_with_their_speed(kind, seed):
 
 
 @pytest.mark.parametrize("kind, seed", STREETS)
-def test_no_vehicle_is_close_to_ego_vehicle(kind, seed):
+def test_other_vehicles_keep_a_distance_to_the_ego_vehicle(kind, seed):
     scene = make_cached_scene(kind, seed)
     for t in (0.0, 10.0, 20.0):
         m = scene.compute_state(t, HEIGHT)
@@ -98,7 +98,7 @@ def test_no_vehicle_is_close_to_ego_vehicle(kind, seed):
         assert (gap > 0.6 * scene.trajectory.speed).all()
 
 
-def test_solids_have_velocity_and_class_of_owner():
+def test_solids_have_velocity_and_class_of_their_object():
     for kind in STREET_KINDS:
         m = make_cached_scene(kind, 0).compute_state(3.0, HEIGHT)
         speed = dict(zip(m.track_ids, m.speeds))
@@ -109,7 +109,7 @@ def test_solids_have_velocity_and_class_of_owner():
         assert (m.solids.semantic > 0).all() and (m.solids.half_size > 0).all()
 
 
-def test_islands_are_at_crossings_and_off_lanes():
+def test_traffic_islands_are_at_crossings_outside_lanes():
     count = 0
     for kind, seed in STREETS:
         scene = make_cached_scene(kind, seed)
@@ -126,7 +126,7 @@ def test_islands_are_at_crossings_and_off_lanes():
     assert count > 10
 
 
-def test_streets_have_objects_that_kitti_labels():
+def test_streets_have_about_as_many_objects_as_kitti():
     """The 57 labelled KITTI frames have 1.7 cars, 0.19 pedestrians and 0.14 cyclists within 30 m in
     the camera's view. The limits are wide, because hidden objects have no label there, and the
     numbers are small (11 pedestrians, 8 cyclists)."""
@@ -149,7 +149,7 @@ def test_streets_have_objects_that_kitti_labels():
     assert (counts.sum(axis=0)[: len(CLASSES) - 1] > 0).sum() >= 6
 
 
-def test_people_option_scales_number_of_people():
+def test_people_option_scales_the_number_of_people():
     def count_people(factor):
         labels = [a.obj.label for a in make_cached_scene("residential", 0, factor).actors]
         return sum(label in ("Pedestrian", "Person_sitting", "Cyclist") for label in labels)

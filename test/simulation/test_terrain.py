@@ -21,7 +21,7 @@ from lidar_perception.simulation.terrain import (
 pytestmark = pytest.mark.no_cover  # covered by other tests
 
 
-def test_flat_ground_range_is_height_over_sine():
+def test_range_to_flat_ground_is_height_over_sine():
     plain = replace(SENSOR, lifts=())
     hits = cast_rays(make_crowd(0, 0), Ground(), OVER_ROAD, plain)
     sine = -np.sin(np.array(plain.elevations))
@@ -44,7 +44,7 @@ def cast_on_ground(ground, position=(3.0, 0.4), sensor=None):
 @pytest.mark.parametrize(
     "ground", [FULL, FULL._replace(crossings=()), FULL._replace(wave_height=0.0, camber=0.05), Ground(0.02, -0.03, 0.1)]
 )
-def test_hit_is_on_surface_of_ground(ground):
+def test_hit_lies_on_the_ground_surface(ground):
     xyz, semantic, is_hit, _ = cast_on_ground(ground)
     x, y, z = xyz.T
     error = z - compute_ground_height(ground, x, y)
@@ -68,7 +68,7 @@ def test_no_ray_passes_through_ground():
         assert (z - compute_ground_height(FULL, x, y)).min() > -2e-3
 
 
-def test_road_sidewalk_and_grass_have_their_classes():
+def test_road_sidewalk_and_grass_have_separate_classes():
     xyz, semantic, _, _ = cast_on_ground(FULL, sensor=replace(SENSOR, azimuth_step=np.radians(0.25)))
     x, y, _ = xyz.T
     crossing = ((x > 8) & (x < 15)) | ((x > -30) & (x < -22))
@@ -94,7 +94,7 @@ def test_bumps_are_bounded_and_the_same_in_every_scan():
     assert np.isfinite(cast_on_ground(rough, (4.0, 0.4))[0]).all()
 
 
-def test_tufts_of_grass_are_rough_and_stop_rays():
+def test_grass_is_rough_and_stops_rays():
     meadow = Ground(curb_left=2.0, curb_right=-2.0, sidewalk_width=0.0, tuft_height=0.6)
     xyz, _, is_hit, hits = cast_on_ground(meadow, sensor=HDL64E)
     height = xyz[:, 2] - compute_ground_height(meadow, xyz[:, 0], xyz[:, 1])
@@ -117,7 +117,7 @@ def march_to_tufts(ground, start, direction):
     return t
 
 
-def test_tuft_hits_agree_with_dense_ray_marching():
+def test_grass_hits_agree_with_dense_ray_marching():
     rng = np.random.default_rng(1)
     meadow = Ground(curb_left=2.0, curb_right=-2.0, sidewalk_width=0.0, tuft_height=0.5)
     yaw, down = rng.uniform(0.3, 2.8, 400), rng.uniform(0.06, 0.3, 400)

@@ -102,7 +102,7 @@ def test_replayed_actions_give_the_same_state(actions, motion):
 
 
 @given(st.lists(ACTIONS, max_size=25), st.sampled_from([STANDING, DRIVING]))
-def test_undo_and_redo_are_inverses_at_any_depth(actions, motion):
+def test_undo_and_redo_are_inverse_at_any_depth(actions, motion):
     last_state, _ = apply_valid(actions, motion)
     history, state = [get_labels(last_state)], last_state
     while state.undo_stack is not None:
@@ -236,7 +236,7 @@ def test_removed_box_is_not_interpolated_again():
 
 
 @given(st.sets(frames, min_size=2), st.integers(1, FRAMES - 1))
-def test_split_and_merge_are_inverses(track_frames, split_frame):
+def test_merge_reverts_split(track_frames, split_frame):
     boxes = make_moving_boxes((5.0, 3.0), (1.0, 0.5), DRIVING, PROPOSED)
     removed_frames = frozenset({0}) - track_frames
     track = Track(1, "Pedestrian", boxes={f: boxes[f] for f in track_frames}, removed_frames=removed_frames)
@@ -256,7 +256,7 @@ def test_split_and_merge_are_inverses(track_frames, split_frame):
     assert resplit_state.tracks[3] == replace(split_state.tracks[2], id=3)
 
 
-def test_trim_keeps_the_same_boxes_as_split():
+def test_trim_and_split_keep_the_same_boxes():
     boxes = make_moving_boxes((5.0, 3.0), (1.0, 0.5), DRIVING, PROPOSED)
     state = State({1: Track(1, "Pedestrian", boxes=boxes)}, seeds=((2, 1), (6, 1)), next_id=2)
     early, _ = apply(state, {"do": "trim", "track": 1, "frame": 3, "side": "after"}, DRIVING)
@@ -285,7 +285,7 @@ def test_copied_box_keeps_its_fixed_position():
     assert all(boxes_are_close(DRIVING.to_fixed(b.values, f), DRIVING.to_fixed(box, 1)) for f, b in copies.items())
 
 
-def test_next_uncertain_wraps_around():
+def test_search_for_next_uncertain_track_wraps_around():
     def track(number, score, **more):
         return Track(number, "Car", score=score, boxes={0: Box((9.0,) * 7, PROPOSED)}, **more)
 
@@ -313,7 +313,7 @@ def test_rejecting_the_rest_is_undone_as_one_action():
 
 
 @given(st.lists(ACTIONS, max_size=6), ACTIONS)
-def test_joined_action_is_undone_with_the_previous_one(earlier_actions, action):
+def test_joined_actions_are_undone_together(earlier_actions, action):
     state, _ = apply_valid(
         [*earlier_actions, {"do": "add", "frame": 1, "box": [5, 0, 0, *SIZE, 0], "class": "Van"}], DRIVING
     )

@@ -16,7 +16,7 @@ from lidar_studio.drive import Scan, ScanCache, select_drive
 from lidar_studio.snap import align_heading, fit_clicked_box, resize_box
 
 
-def test_scan_cache_is_bounded_and_makes_a_scan_once():
+def test_scan_cache_is_bounded_and_computes_each_scan_once():
     made_frames = []
 
     def make_scan(i):

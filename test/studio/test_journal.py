@@ -77,7 +77,7 @@ def test_kill_while_writing_loses_no_confirmed_action(tmp_path):
             assert [line["seq"] for line in journal.lines] == list(range(1, len(journal.lines) + 1))
 
 
-def test_second_process_is_rejected_until_the_first_is_killed(tmp_path):
+def test_journal_is_locked_until_its_process_is_killed(tmp_path):
     with subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], text=True, stdout=subprocess.PIPE) as process:
         process.stdout.readline()
         with pytest.raises(InputError, match="another process"), open_journal(tmp_path, HEADER):

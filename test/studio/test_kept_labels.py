@@ -142,7 +142,7 @@ def test_concurrent_exports_are_complete(tmp_path):
         assert not [n for n in os.listdir(tmp_path) if n.endswith(".tmp")]
 
 
-def test_journal_is_rejected_if_poses_appear_or_disappear(tmp_path):
+def test_journal_is_rejected_if_poses_were_added_or_removed(tmp_path):
     drive_without_poses, drive_with_poses = (
         make_drive(),
         Drive(

@@ -37,7 +37,7 @@ def make_command_line(*arguments):
     return [sys.executable, "-m", "lidar_perception.cli.main", *arguments]
 
 
-def test_slow_page_is_disconnected():
+def test_page_that_reads_too_slowly_is_disconnected():
     async def overflow_queue():
         queue, sent_events = asyncio.Queue(MAX_QUEUED_EVENTS), []
         page = SimpleNamespace(pages={queue}, closed=False)

@@ -62,7 +62,7 @@ def list_shown_frames(live):
     return [event["live"]["frame"] for event in live.events if "live" in event]
 
 
-def test_frame_waits_for_its_boxes_and_late_ones_are_counted(live, monkeypatch):
+def test_frame_waits_for_its_boxes_and_counts_late_ones(live, monkeypatch):
     live.add_cloud(cloud(10))
     live.add_boxes(FOUND, boxes(10), None)  # the first boxes; from now on clouds wait for this topic
     live.add_cloud(cloud(20))
@@ -80,7 +80,7 @@ def test_frame_waits_for_its_boxes_and_late_ones_are_counted(live, monkeypatch):
     assert [t["late"] for t in live.get_status()["topics"]] == [1]
 
 
-def test_early_boxes_wait_and_unmatched_ones_are_counted(live):
+def test_early_boxes_wait_and_unmatched_boxes_are_counted(live):
     live.add_boxes(FOUND, boxes(10), None)
     live.add_cloud(cloud(10))
     assert len(live.make_layers(0, 0.0)["detections"]["fused_detector"]) == 1
@@ -91,7 +91,7 @@ def test_early_boxes_wait_and_unmatched_ones_are_counted(live):
 
 
 @given(st.lists(st.integers(1, 2000), min_size=1, max_size=60), st.integers(1, 12), st.integers(1, 40_000))
-def test_memory_is_bounded_and_the_newest_frame_is_stored(sizes, most, max_bytes):
+def test_live_view_has_bounded_memory_and_keeps_newest_frame(sizes, most, max_bytes):
     live = LiveGraph("test", max_bytes, most)
     for stamp, size in enumerate(sizes):
         live.add_cloud(cloud(stamp, size))
@@ -106,7 +106,7 @@ def test_memory_is_bounded_and_the_newest_frame_is_stored(sizes, most, max_bytes
             live.load_scan(live.first - 1)
 
 
-def test_frames_stay_and_new_ones_are_counted_while_paused(live):
+def test_paused_view_keeps_its_frames_and_counts_new_ones(live):
     for stamp in range(4):
         live.add_cloud(cloud(stamp))
     live.set_paused(1, True)
@@ -272,7 +272,7 @@ def test_boxes_of_another_robot_are_not_selected():
     assert set(select_box_topics(one, "/ouster/points")) == {FOUND, TRACKED, TRUTH}
 
 
-def test_requests_while_topics_change_are_thread_safe(live):
+def test_requests_during_topic_changes_are_thread_safe(live):
     before, wrong = sys.getswitchinterval(), []
     sys.setswitchinterval(1e-6)
     over = threading.Event()

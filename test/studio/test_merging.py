@@ -77,7 +77,7 @@ def test_trimmed_track_is_not_extended_beyond_the_trim():
     assert sorted(extended_track.boxes) == [0, 1, 2, 3] and not extended_track.is_partly_tracked
 
 
-def test_both_of_two_clicks_in_one_frame_become_objects():
+def test_two_clicks_in_one_frame_create_two_tracks():
     survey = FrameSurvey(Detections.none(), np.zeros((0, 7)), np.zeros((0, 80), np.uint32), {}, np.zeros((0, 7)))
     placed_boxes = [(np.array([x, 0.0, -1, 0.8, 0.6, 1.7, 0]), "Pedestrian") for x in (5.0, 9.0)]
     objects, _ = find_objects(survey, ProposalRequest(), placed_boxes)

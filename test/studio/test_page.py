@@ -25,7 +25,7 @@ def test_click_on_a_person_creates_a_track_and_a_seed(page, labels, person):
     assert page.inner_text("#who") == f"Track {number}"
 
 
-def test_seed_works_without_a_mouse(page, labels, person):
+def test_seed_can_be_placed_by_keyboard(page, labels, person):
     before = set(labels.tracks())
     labels.look_at(page, person)
     page.locator("#tracks").focus()
@@ -76,7 +76,7 @@ def test_all_controls_fit_into_half_a_screen(page, labels, person):
         ("#handles", "+z", (0, -40)),
     ],
 )
-def test_dragged_face_moves_alone(page, labels, person, selector, name, offset):
+def test_dragging_a_face_moves_only_that_face(page, labels, person, selector, name, offset):
     number = labels.add_track(page, person)
     before = labels.box(number)
     drag(page, get_centre(page, f"{selector} circle[data-handle='{name}']"), offset)
@@ -88,7 +88,7 @@ def test_dragged_face_moves_alone(page, labels, person, selector, name, offset):
 
 
 @pytest.mark.parametrize("key", ["s", "Escape"])
-def test_handles_disappear_immediately_with_the_key(page, labels, person, key):
+def test_key_hides_the_handles_immediately(page, labels, person, key):
     labels.add_track(page, person)
     page.wait_for_function("() => document.getElementById('handles').style.display === ''")
     assert (
@@ -104,7 +104,7 @@ def test_handles_disappear_immediately_with_the_key(page, labels, person, key):
     )
 
 
-def test_body_is_dragged_horizontally_and_turns_about_its_centre(page, labels, person):
+def test_body_moves_horizontally_and_rotates_about_its_centre(page, labels, person):
     number = labels.add_track(page, person)
     before = labels.box(number)
     drag(page, get_centre(page, "[data-view=top] rect.body"), (30, 10))
@@ -136,7 +136,7 @@ def test_arrow_keys_move_along_the_box_as_one_action(page, labels, person):
     assert wrap_angle(labels.box(number)[6] - before[6]) == pytest.approx(math.radians(1))
 
 
-def test_input_applies_to_the_track_and_frame_where_it_began(page, labels, person):
+def test_input_applies_to_the_track_and_frame_at_its_start(page, labels, person):
     other, number = labels.add_track(page, person), labels.add_track(page, person)
     labels.wait(page, other, lambda t: t is not None)
     page.click("[data-filter=all]")
@@ -169,7 +169,7 @@ def test_pressed_row_is_selected_even_if_the_list_changes(page, labels, person):
         page.wait_for_selector(f"[data-track='{chosen}'][aria-selected=true]")
 
 
-def test_small_drag_moves_no_box_and_space_presses_no_button(page, labels, person):
+def test_small_drag_and_space_key_do_not_change_boxes(page, labels, person):
     number = labels.add_track(page, person)
     lines = len(labels.lines())
     drag(page, get_centre(page, "[data-view=top] rect.body"), (2, 2))
@@ -235,7 +235,7 @@ def test_rejecting_all_undecided_tracks_is_undone_at_once(page, labels, person):
     assert labels.tracks() == before
 
 
-def test_pages_see_each_others_edits(page, browser, labels, person):
+def test_edits_appear_on_other_pages(page, browser, labels, person):
     number = labels.add_track(page, person)
     with open_page(browser, labels.url) as other, open_page(browser, labels.url) as third:
         page.keyboard.press("3")
@@ -277,7 +277,7 @@ def test_export_is_written_and_not_overwritten(page, labels, person):
     assert "openlabel" in json.loads((labels.out / "labels.json").read_text())
 
 
-def test_failed_import_is_reported_in_the_dialog(page, labels):
+def test_failed_import_is_shown_in_the_dialog(page, labels):
     page.click("#import")
     page.fill("#import-path", "/nowhere")
     page.click("#import-form button.primary")
@@ -286,7 +286,7 @@ def test_failed_import_is_reported_in_the_dialog(page, labels):
     assert "/nowhere" not in page.inner_text("#errors")
 
 
-def test_help_lists_the_keys_and_works_without_a_mouse(page):
+def test_help_lists_the_keys_and_opens_by_keyboard(page):
     page.keyboard.press("?")
     page.wait_for_selector("#help[open]")
     assert "Accept" in page.inner_text("#keys") and "Undo" in page.inner_text("#keys")

@@ -11,7 +11,7 @@ from labeling_pages import get_boxes, open_page
 pytestmark = pytest.mark.no_cover  # covered by other tests
 
 
-def test_typed_number_changes_one_value_and_escape_cancels(page, labels, person):
+def test_typed_number_changes_one_value_unless_cancelled(page, labels, person):
     number = labels.add_track(page, person)
     page.click("[data-filter=all]")
     before, lines = labels.box(number), len(labels.lines())
@@ -39,7 +39,7 @@ def test_typed_number_changes_one_value_and_escape_cancels(page, labels, person)
     labels.wait(page, number, lambda t: get_boxes(t)[0][:2] == [3.25, 2.125])
 
 
-def test_keys_while_a_frame_loads_apply_to_the_shown_one(browser, page, labels, person):
+def test_keys_apply_to_the_shown_frame_while_another_loads(browser, page, labels, person):
     number = labels.add_track(page, person)
     before, held = labels.box(number), []
     with open_page(browser, f"{labels.url}&track={number}") as other:
@@ -56,7 +56,7 @@ def test_keys_while_a_frame_loads_apply_to_the_shown_one(browser, page, labels, 
     assert math.dist(labels.box(number)[:2], before[:2]) == pytest.approx(0.05)
 
 
-def test_each_frame_is_checked_once_at_any_key_speed(browser, page, labels):
+def test_each_frame_is_checked_once_at_any_typing_speed(browser, page, labels):
     with open_page(browser, labels.url) as other:
         held = []
         other.route("**/api/cloud/4*", lambda route: held.append(route))
@@ -78,7 +78,7 @@ def test_each_frame_is_checked_once_at_any_key_speed(browser, page, labels):
         other.wait_for_function("() => page.store.checked.size === 0")
 
 
-def test_arrow_key_moves_the_box_after_a_class_is_chosen_by_mouse(page, labels, person):
+def test_arrow_key_moves_the_box_after_class_selection(page, labels, person):
     number = labels.add_track(page, person)
     before = labels.box(number)
     page.click("#class")
@@ -97,7 +97,7 @@ def test_arrow_key_moves_the_box_after_a_class_is_chosen_by_mouse(page, labels, 
     page.click("#errors .toast button")
 
 
-def test_outdated_server_state_reverts_nothing(browser, page, labels, person):
+def test_outdated_server_state_does_not_revert_edits(browser, page, labels, person):
     number, states = labels.add_track(page, person), []
 
     def reply(route):

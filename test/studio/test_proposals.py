@@ -86,7 +86,7 @@ def get_tracks_without_ids(session):
     }
 
 
-def test_click_in_a_long_drive_is_tracked_nearby_first(session, drive, tmp_path, monkeypatch):
+def test_nearby_frames_of_a_click_are_tracked_first(session, drive, tmp_path, monkeypatch):
     session.propose()
     click_person(session)
     expected = get_tracks_without_ids(session)
@@ -140,7 +140,7 @@ def test_clicked_car_is_a_seed_and_similar_cars_are_proposed(session):
 
 
 @given(st.floats(0.5, 12), st.floats(0.3, 3), st.floats(0.5, 4), st.floats(0.2, 1.2))
-def test_cluster_of_the_same_size_is_most_similar(length, width, height, factor):
+def test_clusters_of_equal_size_are_most_similar(length, width, height, factor):
     length, width = max(length, width), min(length, width)
     size = length, width, height
     shape = np.array([[9.0, 0, 0, *size, 0.3]])
@@ -244,7 +244,7 @@ def test_seed_corrected_before_tracking_is_tracked(drive, tmp_path, monkeypatch,
     assert [f for f, b in track.boxes.items() if b.kind == KEY] == [0, 1]
 
 
-def test_undoing_a_correction_keeps_the_track_complete(session, monkeypatch):
+def test_undoing_a_correction_keeps_all_boxes_of_the_track(session, monkeypatch):
     monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
     session.propose()
     tasks, start = [], session._start
@@ -335,7 +335,7 @@ def test_survey_is_cached_and_repeated_if_the_cache_is_damaged(drive, tmp_path):
         assert len(session.state.tracks) >= 1 and session.state.seeds
 
 
-def test_person_clicked_before_the_survey_is_tracked_after_it(session):
+def test_person_clicked_before_the_survey_is_tracked_later(session):
     _, track = click_person(session)
     assert len(track.boxes) == 1
     session.propose()

@@ -51,7 +51,7 @@ def wrong(*arguments, **more):
     return {"missed": result["missed"], "false": result["false"]}
 
 
-def test_exact_detections_leave_nothing_missed_or_false():
+def test_exact_detections_have_no_errors():
     ids = [CAR, CAR, PEDESTRIAN]
     boxes = np.vstack([CARS, [[8.0, -3, -1, 0.6, 0.6, 1.7, 0]]])
     found = Detections.of(boxes, ids, [0.9, 0.4, 0.7])
@@ -65,14 +65,14 @@ def test_detection_below_the_minimum_score_is_ignored():
     assert wrong(truth(CARS[:1], [CAR]), found, 0.0) == {"missed": [], "false": [1]}
 
 
-def test_second_box_on_a_car_and_wrong_class_are_false():
+def test_duplicate_and_wrong_class_are_false_positives():
     found = Detections.of(np.vstack([CARS[:1], CARS[:1]]), CAR, [0.9, 0.8])
     assert wrong(truth(CARS[:1], [CAR]), found, 0.0)["false"] in ([0], [1])
     other = Detections.of(CARS[:1], PEDESTRIAN, 0.9)
     assert wrong(truth(CARS[:1], [CAR]), other, 0.0) == {"missed": [0], "false": [0]}
 
 
-def test_van_is_neither_missed_nor_a_false_car():
+def test_detected_van_is_not_an_error():
     assert wrong(truth(CARS[:1], [VAN]), Detections.none(), 0.0) == {"missed": [], "false": []}
     found = Detections.of(CARS[:1], CAR, 0.9)
     assert wrong(truth(CARS[:1], [VAN]), found, 0.0) == {"missed": [], "false": []}
@@ -98,7 +98,7 @@ def test_every_label_and_detection_is_counted_once(labels, detections, classes):
     )
 
 
-def test_source_does_not_miss_classes_it_cannot_detect(drive_bag):
+def test_classes_unknown_to_a_source_are_not_missed(drive_bag):
     frame = next(iter(open_recording(drive_bag)))
     blind = Source(lambda i, frame: Detections.none(), frozenset(["Pedestrian"]))
     layers = Results({"blind": blind}).make_layers(0, frame, 0.3)

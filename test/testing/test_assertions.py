@@ -64,7 +64,7 @@ def test_every_type_of_detections_gives_the_same_message(make):
 
 
 @pytest.mark.parametrize("limit", [{"max_distance": 0.5}, {"min_iou": 0.3}])
-def test_order_does_not_matter_and_removed_detection_is_missing(limit):
+def test_order_does_not_matter_and_missing_detection_is_named(limit):
     """Objects that are missing in one direction are extra in the other."""
     rng = np.random.default_rng(1)
     for _ in range(30):
@@ -114,7 +114,7 @@ def test_invalid_detections_are_rejected(found, words):
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_bag_round_trip_of_arrays(make_bag, storage):
+def test_arrays_survive_writing_to_a_bag(make_bag, storage):
     truths = [walker_truth(), None, [("Pedestrian", walker_truth().boxes[0])]]
     path = make_bag([scene(i) for i in range(3)], truths, storage=storage, points="/front", hz=5.0)
     assert [p.suffix for p in path.iterdir() if p.name != "metadata.yaml"] == [
@@ -163,5 +163,5 @@ def test_missing_launch_package_is_reported(monkeypatch):
             call()
 
 
-def test_reserved_domain_stays_private_without_processes():
+def test_reserved_domains_are_distinct():
     assert len({reserve_domain() for _ in range(5)}) == 5

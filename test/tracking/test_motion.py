@@ -66,7 +66,7 @@ def test_update_shrinks_covariance_and_moves_to_measurement():
 
 
 @given(st.floats(-3.1, 3.1), st.floats(-1.4, 1.4))
-def test_opposite_headings_give_same_update(heading, off):
+def test_opposite_headings_give_equal_updates(heading, off):
     means = np.array([[0, 0, 0, 0, heading, 0.0]])
     ends = [
         update(means, spread(2), np.array([[0.1, 0.2, heading + off + k * np.pi]]), np.full((1, 3), 0.2))[0]
@@ -76,7 +76,7 @@ def test_opposite_headings_give_same_update(heading, off):
     assert wrap_angle(ends[0][0, 4] - ends[1][0, 4]) == pytest.approx(0, abs=1e-7)
 
 
-def test_lateral_speed_decays_and_reversed_heading_flips():
+def test_lateral_speed_decays_and_reversed_heading_is_flipped():
     means = np.array([[0.0, 0, 5, 1, 0, 0]])
     kept, p = constrain_to_heading(means, np.eye(6)[None], np.array([0.1]))
     across = [np.cos(m[4]) * m[3] - np.sin(m[4]) * m[2] for m in (means[0], kept[0])]
@@ -89,7 +89,7 @@ def test_lateral_speed_decays_and_reversed_heading_flips():
     assert again.tolist() == flipped.tolist()  # the measured headings do not flip it back
 
 
-def test_covariances_rotate_with_axes():
+def test_covariances_rotate_with_the_axes():
     angle = 0.7
     cos, sin = np.cos(angle), np.sin(angle)
     p = spread(5)

@@ -27,7 +27,7 @@ def detector(data):
 
 
 @pytest.mark.parametrize("ego", ["none", "auto"])
-def test_no_id_switches_on_real_drive(data, detector, ego):
+def test_real_drive_has_no_id_switches(data, detector, ego):
     """The drive has no poses, so auto uses KISS-ICP."""
     from lidar_perception.data.frame import POSES
     from lidar_perception.data.open import open_recording

@@ -130,7 +130,7 @@ def test_occluded_track_lasts_equally_long_at_any_rate(rate):
     assert (started(1.4), started(2.0)) == (1, 2)
 
 
-def test_weak_detections_continue_but_never_start_tracks():
+def test_weak_detections_continue_tracks_but_start_none():
     weak = TrackingParams().association.strong / 2
     tracker = Tracker()
     track([cars(car(10), scores=weak)] * 10, tracker=tracker)
@@ -143,14 +143,14 @@ def test_weak_detections_continue_but_never_start_tracks():
     assert tracks[-1].ids.tolist() == [1] and tracks[-1].seen[0]
 
 
-def test_correlated_observations_are_discounted():
+def test_repeated_observations_add_less_evidence():
     looks = np.arange(1.0, 500.0)
     once = discount_observations(looks, 0.5)
     assert once[0] == 1 and (np.diff(once) > 0).all() and once[-1] < 1 / 0.5
     np.testing.assert_allclose(discount_observations(looks, 0.0), looks)
 
 
-def test_constantly_low_scores_keep_a_track_at_low_score():
+def test_constantly_low_scores_keep_the_track_score_low():
     """A neutral score adds no evidence, however often it occurs."""
     neutral = TrackingParams().existence.neutral
     tracker = Tracker(with_values(TrackingParams(), {"report": 0.0}))
@@ -195,7 +195,7 @@ def test_one_of_two_overlapping_tracks_ends():
     assert all(len(t) == 1 for t in track([both] * 5))
 
 
-def test_lost_frame_is_predicted():
+def test_tracks_are_predicted_over_a_lost_frame():
     tracker = Tracker()
     track([cars(car(10 + i)) for i in range(10)], tracker=tracker)
     later = tracker.predict(START + 9 * TENTH + 2 * TENTH)
@@ -219,7 +219,7 @@ def test_missing_equal_late_and_jumping_stamps_are_handled():
     assert tracker.problem is None
 
 
-def test_short_loop_is_a_jump_not_late_frames():
+def test_short_loop_is_a_time_jump_and_not_late_frames():
     tracker, short = Tracker(), [START + i * TENTH for i in range(6)]
     tracks = track([cars(car(10))] * 18, tracker=tracker, stamps=short * 3)
     assert tracker.ended_count == 2
@@ -331,7 +331,7 @@ def test_parked_cars_keep_ids_from_turning_car_without_poses():
         np.testing.assert_allclose(t.detections.boxes[:, :2], found.boxes[:, :2], atol=0.3)
 
 
-def test_fast_object_is_probably_not_a_pedestrian():
+def test_high_speed_lowers_the_pedestrian_probability():
     """This needs poses: relative to a moving sensor everything is fast."""
 
     def score(speed, at):

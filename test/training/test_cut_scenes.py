@@ -183,7 +183,7 @@ def test_augmented_clusters_stay_in_boxes_and_thin_with_range(rng):
     assert np.allclose(wrap_angle(twice[1] - BOXES), 0, atol=1e-6)
 
 
-def test_box_crops_are_near_boxes_and_never_empty(rng):
+def test_box_crops_are_near_their_boxes_and_never_empty(rng):
     clusters = fill_boxes(rng, BOXES * [1, 1, 1, 1.4, 1.4, 1.4, 1], 300)
     augmented, boxes = augment_clusters(clusters, BOXES, np.ones(4, bool), STILL, rng)
     assert np.allclose(boxes, BOXES) and (augmented.sizes < 300).all() and (augmented.sizes > 80).all()
@@ -279,7 +279,7 @@ def test_fraction_of_sparse_scenes_is_reproducible(rng, tmp_path):
     assert (np.abs(sizes - expected) < 5 * np.sqrt(expected)).all()
 
 
-def test_wrong_proposals_become_decoys_unless_they_touch_label(rng, tmp_path, monkeypatch):
+def test_wrong_proposals_away_from_labels_become_decoys(rng, tmp_path, monkeypatch):
     flat = np.column_stack([rng.uniform(-20, 30, (12_000, 2)), rng.normal(-1.73, 0.01, 12_000), rng.random(12_000)])
     empty = BOXES[0] + [8, 8, 0, 0, 0, 0, 0]
     points = np.concatenate([flat, fill_boxes(rng, np.array([BOXES[0], empty]), 500).points])
@@ -297,7 +297,7 @@ def test_wrong_proposals_become_decoys_unless_they_touch_label(rng, tmp_path, mo
     assert (cut.labels[cut.is_box_crop] < none).sum() == 1
 
 
-def test_half_of_background_is_decoys(rng):
+def test_half_of_the_background_samples_are_decoys(rng):
     scene = sample_scene(rng)
     background = np.flatnonzero(scene.labels == 3)
     for decoys in (0, 4, 30):
@@ -319,7 +319,7 @@ def sample_scene(rng, count=40):
     return CutScene(clusters, labels, boxes, np.zeros(len(labels), bool))
 
 
-def test_sample_limits_each_class_and_drops_unknown(rng):
+def test_sampling_limits_each_class_and_drops_unknown(rng):
     scene = sample_scene(rng)
     scene.labels[:3] = UNKNOWN
     params = ClusterAugmentParams(objects=7, background=5)
@@ -331,7 +331,7 @@ def test_sample_limits_each_class_and_drops_unknown(rng):
         ClusterPreparation(CONFIG, params)(nothing, rng)
 
 
-def test_only_background_becomes_reflective(rng):
+def test_only_background_gets_high_intensity(rng):
     scene = sample_scene(rng)
     scene.clusters.points[:, 3] = 0.3
     before = scene.clusters.points.copy()

@@ -89,7 +89,7 @@ def test_fitted_scores_are_probabilities_in_any_order_of_scans(seed):
     assert models["Car"] == load_shipped_models()["Car"] and fits["Car"].new_score is None
 
 
-def test_clouds_without_intensity_get_their_own_curves(tmp_path, monkeypatch):
+def test_separate_curves_are_fitted_without_intensity(tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     samples = {kind: draw_samples(rng, 2000, PEDESTRIAN, odds) for kind, odds in zip(CLOUD_KINDS, (-1.5, 1.0))}
     monkeypatch.setattr(fusion_curves, "simulate_samples", lambda *_: samples)
@@ -118,7 +118,7 @@ def test_curves_are_not_fitted_to_too_few_samples():
 
 
 @pytest.mark.parametrize("camera", [None, FORWARD_CAMERA], ids=["all around", "in an image"])
-def test_objects_count_once_and_vans_do_not_count(camera: Camera | None):
+def test_objects_count_once_and_vans_are_ignored(camera: Camera | None):
     car, person = [10, 0, -0.9, 4, 1.7, 1.5, 0], [12, 4, -0.8, 0.6, 0.6, 1.8, 0]
     behind, van = [-10, 0, -0.9, 4, 1.7, 1.5, 0], [10, 5, -0.7, 4.7, 1.9, 2.0, 0]
     nearly = np.add(person, [0.3, 0.2, 0, 0, 0, 0, 0])
@@ -152,7 +152,7 @@ def others(tmp_path):
     return tmp_path / "fused.json", models
 
 
-def test_fusion_file_round_trip_in_moved_folder(others, tmp_path, monkeypatch):
+def test_fusion_file_can_be_read_after_its_folder_is_moved(others, tmp_path, monkeypatch):
     path, models = others
     fusion = read_fusion(path)
     assert fusion.models == models and fusion.fitted_to == {"scans": 3}
@@ -182,11 +182,11 @@ def test_invalid_curves_without_intensity_are_rejected(curves, tmp_path):
         read_fusion(path)
 
 
-def test_package_proposer_of_pointnet_is_that_of_fused():
+def test_pointnet_trains_with_the_proposer_of_fused():
     assert find_proposer(PointNetTraining(proposer="package")) == find_fusion().proposer
 
 
-def test_package_curves_warn_about_other_weights(others):
+def test_shipped_curves_warn_about_other_weights(others):
     path, _ = others
     assert find_fusion().curve_warning is None and check_weights(SHIPPED_FILE, 1.73) == []
     assert open_detector("fused", "cpu").warning is None
@@ -227,7 +227,7 @@ def test_detector_uses_curves_of_its_file_at_any_range(others):
     assert load_fused_detector(path, "cpu", half).proposer.network.amp == "bf16"
 
 
-def test_damaged_file_is_used_or_rejected_in_one_line(tmp_path):
+def test_damaged_file_is_accepted_or_rejected_in_one_line(tmp_path):
     rng, path, refused = np.random.default_rng(0), tmp_path / "damaged.json", 0
     evidence = {name: np.array([-9.0, 0.0, np.nan, np.inf]) for name in KNOTS}
     for _ in range(100):

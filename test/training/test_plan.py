@@ -56,7 +56,7 @@ data = st.one_of(
 
 
 @given(speeds, data, st.floats(0.3, 100), st.integers(1, 64))
-def test_plan_fits_budget_or_error_suggests_a_larger_one(speed, data, hours, cores):
+def test_plan_fits_the_budget_or_suggests_a_larger_one(speed, data, hours, cores):
     try:
         plan = fit_plan(hours, cores, speed, data)
     except InputError as error:
@@ -86,14 +86,14 @@ def test_more_time_or_cores_give_larger_plan():
     assert slow.scans < fit_plan(1.0, 4, SPEED, SIM).scans
 
 
-def test_plan_keeps_numbers_given_by_the_user():
+def test_plan_keeps_values_given_by_the_user():
     plan = fit_plan(1.0, 2, SPEED, SIM, Plan(scans=30, val_scans=7, steps=5000, validate_steps=11, part=False))
     assert plan == Plan(30, 7, 30, 5000, 11, False)  # although it takes longer than the budget
     assert fit_plan(1.0, 2, SPEED, SIM, Plan(scans=100), epochs=3).steps == 75
     assert fit_plan(1.0, 2, SPEED, SIM, Plan(steps=10)).scans <= 40  # not more scans than the steps use
 
 
-def test_pace_counts_steps_that_fit_between_validations(monkeypatch):
+def test_remaining_steps_include_the_time_of_validations(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(loop.time, "monotonic", lambda: now[0])
     budget = TimeBudget(deadline=1000.0, validate_steps=10)
@@ -119,6 +119,6 @@ def test_pace_counts_steps_that_fit_between_validations(monkeypatch):
 
 
 @pytest.mark.parametrize("hours", [1e-4, 0.01])
-def test_error_for_short_budget_suggests_larger_one(hours):
+def test_too_short_budget_is_rejected_with_a_suggestion(hours):
     with pytest.raises(InputError, match="give --budget"):
         fit_plan(hours, 2, SPEED, SIM)

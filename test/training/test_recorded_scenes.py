@@ -97,7 +97,7 @@ def test_split_file_selects_frames(tmp_path):
 
 
 @given(st.lists(st.integers(1, 60), min_size=1, max_size=8).filter(lambda n: sum(n) > 1), st.floats(0, 1), seeds)
-def test_held_out_frames_are_complete_drives_and_one_end(lengths, share, seed):
+def test_held_out_frames_are_whole_drives_and_one_end(lengths, share, seed):
     ends = np.cumsum(lengths)
     drives = [range(end - length, end) for end, length in zip(ends, lengths)]
     for draw, items in (draw_items, range(ends[-1])), (draw_drives, drives):
@@ -115,7 +115,7 @@ def test_one_frame_cannot_be_split():
             draw(items, 0.5, 0)
 
 
-def test_labelled_end_of_drive_is_held_out(tmp_path):
+def test_labelled_end_of_a_drive_is_held_out(tmp_path):
     frames = [
         Frame.of(
             str(i),

@@ -123,7 +123,7 @@ def test_run_directory_is_locked(tmp_path):
 
 
 @pytest.mark.parametrize("more", [[], ["--resume"]])
-def test_foreign_weights_in_out_are_not_replaced(tmp_path, more):
+def test_weights_of_another_run_in_out_are_not_replaced(tmp_path, more):
     weights = tmp_path / "run/best.safetensors"
     weights.parent.mkdir()
     shutil.copy(find_pointnet_weights(PointNetParams()), weights)

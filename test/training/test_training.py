@@ -120,7 +120,7 @@ def test_killed_run_loses_at_most_one_save_interval(unbroken, tmp_path, step):
     assert equals(tmp_path, unbroken[0])
 
 
-def test_state_is_saved_if_preparing_process_dies(unbroken, tmp_path):
+def test_state_is_saved_if_loading_samples_fails(unbroken, tmp_path):
     class Short(Toy):
         def batches(self, step):
             yield from islice(super().batches(step), 5)

@@ -101,7 +101,7 @@ def test_points_stay_in_their_boxes(seed):
 
 
 @given(seeds, st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
-def test_slope_keeps_heights_above_ground(seed, ahead, aside):
+def test_slope_keeps_heights_above_the_ground(seed, ahead, aside):
     scene = make_random_scene(seed)
     tilted = raise_scene(scene, 0.3, (ahead, aside))
     for before, after in ((scene.points, tilted.points), (scene.boxes, tilted.boxes)):
@@ -133,7 +133,7 @@ def test_positive_rotation_is_counterclockwise():
 
 
 @given(seeds, st.floats(0, 0.99))
-def test_drop_points_keeps_fraction_and_order(seed, share):
+def test_drop_points_keeps_the_fraction_and_order(seed, share):
     scene = make_random_scene(seed)
     left = drop_points(scene, share, np.random.default_rng(seed))
     assert (len(left.points) == len(scene.points)) or share > 0
@@ -256,7 +256,7 @@ def test_pasted_object_casts_shadow_and_is_not_hidden(seed):
     assert len(paste_objects(make_street(), make_walker(14.0), params, *AREA, rng).boxes) == 1
 
 
-def test_posts_are_pasted_without_boxes():
+def test_posts_are_pasted_without_a_box():
     post = make_wall(8.0, (2.9, 3.1), (-1.73, 0.6))
     walker = make_walker(9.0)
     scene = make_street(post, walker.points, make_wall(11.0, (-8, -5), (-1.73, 0.5)))
@@ -363,7 +363,7 @@ def test_scenes_labelled_all_around_rotate_by_any_angle():
     assert bearings(True).max() > 2.5 and 0.6 < bearings(False).max() <= AugmentParams().turn
 
 
-def test_database_file_round_trip_and_error_names_broken_file(tmp_path):
+def test_database_file_survives_saving_or_is_named_as_broken(tmp_path):
     database = join_databases([cut_objects(make_random_scene(k), ("Car", "Pedestrian"), 5) for k in range(4)])
     assert len(database) > 0 and set(database.class_ids) <= {CAR, PEDESTRIAN}
     database.save(tmp_path / "objects.npz")
@@ -375,7 +375,7 @@ def test_database_file_round_trip_and_error_names_broken_file(tmp_path):
     assert len(join_databases([])) == 0
 
 
-def test_nothing_is_pasted_without_ground():
+def test_objects_are_not_pasted_without_ground():
     database = join_databases([cut_objects(make_random_scene(k), ("Car",), 5) for k in range(4)])
     empty = TrainingScene(np.zeros((0, 4), np.float32), np.zeros((0, 7)), np.zeros(0, int), np.zeros(0, bool))
     assert len(paste_objects(empty, database, AugmentParams(), *AREA, np.random.default_rng(0)).boxes) == 0

@@ -103,7 +103,7 @@ def test_trained_network_opens_as_detector(tmp_path, cache, tiny_size):
     assert read_header(tmp_path / "other/last.safetensors").config.high == header.config.high
 
 
-def test_kitti_and_simulated_scenes_mix_and_broken_ones_count(tmp_path, cache, tiny_size):
+def test_broken_scenes_of_a_mixture_are_counted(tmp_path, cache, tiny_size):
     root = object_folder(tmp_path / "kitti", walker_label() + "\n", 6)
     write(root / "training/label_2/000002.txt", "Pedestrian 0 0 x\n")
     result = train(
@@ -212,7 +212,7 @@ def test_bad_input_is_rejected_at_once(tmp_path, tiny_size, arguments, reason):
     assert not (tmp_path / "run" / "last.pt").exists()
 
 
-def test_fraction_of_the_paper_is_held_out_by_default():
+def test_held_out_fraction_defaults_to_the_paper():
     assert round(PAPER_VAL_FRACTION * 7518) == 751
     text = train("--help").output
     for group in PointPillarsTraining, DataParams:

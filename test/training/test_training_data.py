@@ -267,7 +267,7 @@ class Large:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_killed_worker_ends_training_with_reason(jobs):
+def test_training_ends_with_reason_if_worker_is_killed(jobs):
     batches = load_items(Large(), ([n] for n in range(10**6)), jobs)
     pid = next(batches)[0][0]
     time.sleep(0.2)  # it is sending the next item
@@ -294,7 +294,7 @@ def test_samples_do_not_depend_on_sensor_height():
 
 
 @pytest.mark.parametrize("quarter", range(4))
-def test_labels_in_rotated_camera_equal_those_of_rotated_scene(quarter):
+def test_rotating_the_camera_equals_rotating_the_scene(quarter):
     _, truth = SimulatedScenes(7, 1, SENSOR).load_scan(0)
     yaw = quarter * np.pi / 2
     cos, sin = np.cos(-yaw), np.sin(-yaw)
@@ -309,7 +309,7 @@ def test_labels_in_rotated_camera_equal_those_of_rotated_scene(quarter):
     assert np.allclose(frame.calibration().lidar_to_camera, rotate_camera(yaw).lidar_to_camera)
 
 
-def test_reduced_range_around_keeps_all_directions():
+def test_reduced_range_covers_all_directions():
     around = make_config("v0", "compact", **RANGES["around"])
     part = reduce_range(around, 30.0, 20.0)
     assert part.low[:2] == pytest.approx((-30.72, -20.48)) and part.high[:2] == pytest.approx((30.72, 20.48))

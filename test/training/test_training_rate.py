@@ -45,7 +45,7 @@ def test_learning_rate_equals_one_cycle_of_torch(steps, warm):
 
 @pytest.mark.parametrize("warm", [0.01, 0.25, 0.5, 0.99])
 @pytest.mark.parametrize("steps", [1, 2, 3, 4, 100])
-def test_learning_rate_is_positive_in_shortest_runs(steps, warm):
+def test_learning_rate_is_positive_in_the_shortest_runs(steps, warm):
     assert all(0 < compute_one_cycle(i, steps, 0.1, warm)[0] <= 0.1 for i in range(steps))
 
 
@@ -117,7 +117,7 @@ def planned(tmp_path_factory):
 @pytest.mark.parametrize(
     "seconds", [lambda _: 10.0, lambda step: 4.0 if step < 50 else 12.0, lambda step: 6.0 + 6.0 * (step % 7)]
 )
-def test_slow_run_ends_in_time_with_final_learning_rate(seconds, fits, planned, tmp_path, monkeypatch, capsys):
+def test_slow_run_ends_in_time_at_the_final_learning_rate(seconds, fits, planned, tmp_path, monkeypatch, capsys):
     first = int(fits * 300)
     until = sum(seconds(step) for step in range(first)) + 30.0 * (first // 60 + 1)
     toy, progress = run_timed(seconds, 30.0, tmp_path, monkeypatch, deadline=until)

@@ -39,7 +39,7 @@ def test_decompression_bomb_takes_no_memory(packing, declared):
     tracemalloc.stop()
 
 
-def test_bomb_of_several_frames_is_rejected():
+def test_decompression_bomb_of_several_frames_is_rejected():
     bomb = PACK["zstd"](bytes(1000)) + PACK["zstd"](bytes(2**27))
     with pytest.raises(ValueError, match="more than 1000 bytes"):
         decompress(bomb, "zstd", 1000)

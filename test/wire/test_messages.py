@@ -24,7 +24,7 @@ from msg_utils.point_cloud2 import from_array
 
 
 @each_make
-def test_extrinsics_are_read_in_either_direction(make):
+def test_extrinsics_are_accepted_in_either_direction(make):
     info = make_camera_info(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)
     forth = make_extrinsics(CALIBRATION, header(make), make)
     back = make_extrinsics(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)
@@ -66,7 +66,7 @@ def test_unusable_camera_raises_input_error(make, change, words):
         read_calibration(info, transform).camera()
 
 
-def test_point_is_in_view_if_its_pixel_is_in_the_image():
+def test_point_is_in_view_if_it_projects_into_the_image():
     camera = Camera(np.array([[10.0, 0, 50, 0], [0, 10, 20, 0], [0, 0, 1, 0]]), 100, 40)
     points = np.array(
         [[0, 0, 1], [0, 0, -1], [-5.01, 0, 1], [4.99, 0, 1], [5.01, 0, 1], [0, 1.99, 1], [0, 2.01, 1], [0, -2.01, 1]],
@@ -92,7 +92,7 @@ MESSAGES = {
 
 
 @pytest.mark.parametrize("build", MESSAGES.values(), ids=MESSAGES)
-def test_ros_and_rosbags_read_each_others_bytes(build):
+def test_messages_of_ros_and_rosbags_are_interchangeable(build):
     serialization = pytest.importorskip("rclpy.serialization", reason="needs rclpy")
     ours, theirs = build(make_bag_message), build(make_ros_message)
     name = ours.__msgtype__
@@ -144,7 +144,7 @@ def test_field_with_several_numbers_per_point_is_rejected(make, name):
 
 
 @pytest.mark.parametrize("kind, full", [("<f4", 1), ("<f4", 255), ("<f8", 65535), ("u1", 255), ("<u2", 65535)])
-def test_intensities_are_read_in_every_drivers_scale(kind, full):
+def test_intensities_of_every_driver_are_scaled_to_1(kind, full):
     expected = np.random.default_rng(0).uniform(0, 1, 3000) ** 3
     expected[0] = 1.0
     points = np.ones(len(expected), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", kind)])

@@ -56,7 +56,7 @@ def test_times_of_every_driver_are_read_in_seconds(driver, order):
 
 
 @pytest.mark.parametrize("driver", DRIVERS)
-def test_replaced_points_get_the_time_of_the_stamp(driver):
+def test_motion_compensated_points_have_the_time_of_the_stamp(driver):
     name, values = DRIVERS[driver]
     msg = cloud(name, values)
     chosen = np.arange(0, 1000, 3)
@@ -74,7 +74,7 @@ def test_replaced_points_get_the_time_of_the_stamp(driver):
     np.testing.assert_allclose(read_point_times(after, all_indices(msg)).seconds, 0.0, atol=1e-6)
 
 
-def test_unit_of_a_short_cloud_follows_the_type():
+def test_time_unit_of_a_short_cloud_follows_the_type():
     for name, values, seconds in [
         ("t", np.array([4_000_000, 4_000_001], "<u4"), [4e-3, 4e-3]),
         ("time", np.array([0.01, 0.0105], "<f4"), [0.01, 0.0105]),

@@ -87,7 +87,7 @@ def test_large_ids_wrap_around():
 
 
 @each_make
-def test_odometry_keeps_the_pose(make):
+def test_odometry_message_has_the_pose(make):
     at = pose(3.0, -4.0, 2.5)
     message = make_odometry(at, header(make, frame_id="odom"), "velodyne", make)
     np.testing.assert_allclose(read_pose(message.pose.pose), at, atol=1e-12)
