@@ -52,8 +52,9 @@ def wait_for_stage(process: subprocess.Popen, stage: str, log: Path) -> None:
     """Wait until a starting node blocks signals, has loaded a library, or has logged a word."""
     proc, end = Path(f"/proc/{process.pid}"), monotonic() + LIMIT
     own = Path("/proc/self/cmdline").read_bytes()
-    # Between fork and exec the child still has this process's libraries and blocks all signals.
-    while (proc / "cmdline").read_bytes() == own or not (
+    # Between fork and exec the child still has this process's libraries and blocks all signals,
+    # and the shell of the start script blocks them for a moment whenever it runs a command.
+    while (proc / "cmdline").read_bytes().startswith((own, b"/bin/sh")) or not (
         blocks_signals(proc) if stage == "blocked" else stage in (proc / "maps").read_text() or stage in log.read_text()
     ):
         assert process.poll() is None and monotonic() < end, log.read_text()
@@ -86,6 +87,25 @@ def test_node_stops_cleanly_at_any_stage(how, node, stage, number, processes):
     process.send_signal(number)
     assert process.wait(timeout=60) == 0
     assert not [path for path in segments if path.exists()] and "Traceback" not in log.read_text()
+
+
+@pytest.mark.parametrize("command", ["basename", "dirname", "env"])
+def test_start_script_stops_at_signal_during_command(command, tmp_path):
+    """Send a signal from a command of the script to the whole process group, as a terminal does at Ctrl-C."""
+    script, python, program = tmp_path / "lib/lidar_perception/tracker", tmp_path / "bin/python3", tmp_path / command
+    signalled = tmp_path / "signalled"
+    for path, text in (
+        (script, STARTED_BY["ros2 run"]("tracker")[0].read_text()),
+        (python, f"#!{sys.executable}\nimport signal\nraise SystemExit(not signal.sigpending())\n"),
+        (program, f'#!/bin/sh\n: > "{signalled}"\nkill -INT 0\n'),
+    ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        path.chmod(0o755)
+    code = subprocess.call(
+        [script], env={"PATH": f"{tmp_path}:/usr/bin:/bin"}, start_new_session=True, stderr=subprocess.DEVNULL
+    )
+    assert code == 0 or not signalled.exists()
 
 
 @pytest.mark.parametrize("number", sorted(STOP_SIGNALS))
