@@ -38,38 +38,51 @@ from lidar_perception.nodes.launch_parameters import (
     list_parameter_files,
     split_detectors,
 )
-from lidar_perception.nodes.launching import ARGUMENTS, find_argument_names, reject_unknown_arguments
+from lidar_perception.nodes.launching import ARGUMENTS as GRAPH_ARGUMENTS
+from lidar_perception.nodes.launching import find_argument_names, reject_unknown_arguments
 from lidar_perception.nodes.shared_memory import use_large_shared_memory
 from lidar_perception.wire.clouds import CLOUD_TYPES
 from lidar_perception.wire.topics import POINTS, TF_STATIC
 
-VALUES = (
-    "bag",
-    "detectors",
-    "rate",
-    "loop",
-    "scores",
-    "points",
-    "config",
-    "single",
-    "real_time",
-    "use_sim_time",
-    "log_level",
-)
+# Arguments of detectors.launch.py that are always empty, because the player and the evaluator rely on this.
+# They are passed explicitly, because an including file may have set arguments of these names.
+FIXED_ARGUMENTS = {"namespace": "", "name_prefix": ""}
+ARGUMENTS = {
+    "bag": dict(description="Folder of the bag."),
+    "detectors": dict(
+        default_value="candidates",
+        description="Comma-separated detectors to run and score: candidates, pointpillars, pointnet, fused.",
+    ),
+    "rate": dict(default_value="1.0", description="Speed factor of the replay."),
+    "loop": dict(default_value="false", choices=["true", "false"], description="Restart the bag at its end."),
+    "scores": dict(default_value="", description="JSON file for the scores."),
+    "real_time": dict(
+        default_value="false",
+        choices=["true", "false"],
+        description="true: play the clouds at the rate of the sensor; false: send a cloud "
+        "once the previous ones have results, so that none is lost.",
+    ),
+    **{k: options for k, options in GRAPH_ARGUMENTS.items() if k not in FIXED_ARGUMENTS},
+    "points": dict(
+        default_value="",
+        description="Topic of the clouds in the bag; may be empty if the bag has only one cloud topic.",
+    ),
+    "config": dict(
+        default_value="", description="Comma-separated parameter files, loaded after config/replay*.param.yaml."
+    ),
+    "use_sim_time": dict(default_value="true", choices=["true", "false"], description="Take the time from /clock."),
+}
 HERE = Path(__file__).resolve().parent
 CONFIG = HERE.parent / "config" / "replay.param.yaml"
 # Evaluation protocol of the STM-CPA paper, used if the candidates are replayed.
 PAPER_CONFIG = HERE.parent / "config" / "replay_candidates.param.yaml"
 GLOBAL_TOPICS = {TF_STATIC, "/tf", "/clock", "/diagnostics"}  # topics that are never remapped
 LAST_FRAME_DELAY_S = 1.0  # time for the last frame to be scored after the bag has ended
-# Arguments that the user cannot set, because the player and the evaluator rely on these values. They
-# are passed on because launch would otherwise pass on the user's values to the included file.
-FIXED_ARGUMENTS = {"namespace": "", "name_prefix": ""}
 
 
 def replay(context, argument_names):
-    reject_unknown_arguments(argument_names, context, {*VALUES, "rviz", *ARGUMENTS} - FIXED_ARGUMENTS.keys())
-    value = {k: context.perform_substitution(LaunchConfiguration(k)) for k in VALUES}
+    reject_unknown_arguments(argument_names, context, ARGUMENTS)
+    value = {k: context.perform_substitution(LaunchConfiguration(k)) for k in ARGUMENTS}
     single, detectors = value["single"] == "true", split_detectors(value["detectors"])
     package_files = [str(CONFIG), *([str(PAPER_CONFIG)] if "candidates" in detectors else [])]
     files = [*package_files, *list_parameter_files(value["config"])]
@@ -125,13 +138,7 @@ def replay(context, argument_names):
     )
     graph = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(HERE / "detectors.launch.py")),
-        launch_arguments={
-            "points": make_relative(POINTS),
-            **FIXED_ARGUMENTS,
-            "config": ",".join(files),
-            "detectors": value["detectors"],
-            **{k: LaunchConfiguration(k) for k in ("single", "rviz", "use_sim_time", "log_level")},
-        }.items(),
+        launch_arguments={"points": make_relative(POINTS), **FIXED_ARGUMENTS, "config": ",".join(files)}.items(),
     )
     configurations = context.launch_configurations
     return [
@@ -151,58 +158,7 @@ def generate_launch_description():
     argument_names = find_argument_names()
     return LaunchDescription(
         [
-            DeclareLaunchArgument("bag", description="Folder of the bag."),
-            DeclareLaunchArgument(
-                "detectors",
-                default_value="candidates",
-                description="Comma-separated detectors to run and score: candidates, pointpillars, pointnet, fused.",
-            ),
-            DeclareLaunchArgument(
-                "points",
-                default_value="",
-                description="Topic of the clouds in the bag; may be empty if the bag has only one cloud topic.",
-            ),
-            DeclareLaunchArgument("rate", default_value="1.0", description="Speed factor of the replay."),
-            DeclareLaunchArgument(
-                "loop", default_value="false", choices=["true", "false"], description="Restart the bag at its end."
-            ),
-            DeclareLaunchArgument("scores", default_value="", description="JSON file for the scores."),
-            DeclareLaunchArgument(
-                "config",
-                default_value="",
-                description="Comma-separated parameter files, loaded after config/replay*.param.yaml.",
-            ),
-            DeclareLaunchArgument(
-                "single",
-                default_value="false",
-                choices=["true", "false"],
-                description="Let each detector compute ground and clusters itself.",
-            ),
-            DeclareLaunchArgument(
-                "rviz",
-                default_value="false",
-                choices=["true", "false"],
-                description="Start RViz with config/lidar_perception.rviz.",
-            ),
-            DeclareLaunchArgument(
-                "real_time",
-                default_value="false",
-                choices=["true", "false"],
-                description="true: play the clouds at the rate of the sensor; false: send a cloud "
-                "once the previous ones have results, so that none is lost.",
-            ),
-            DeclareLaunchArgument(
-                "use_sim_time",
-                default_value="true",
-                choices=["true", "false"],
-                description="Take the time from /clock.",
-            ),
-            DeclareLaunchArgument("log_level", **ARGUMENTS["log_level"]),
-            *(
-                DeclareLaunchArgument(name, **options)
-                for name, options in ARGUMENTS.items()
-                if name not in (*VALUES, "rviz", *FIXED_ARGUMENTS)
-            ),
+            *(DeclareLaunchArgument(name, **options) for name, options in ARGUMENTS.items()),
             OpaqueFunction(function=lambda context: replay(context, argument_names)),
         ]
     )

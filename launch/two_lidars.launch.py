@@ -2,6 +2,8 @@
 
     ros2 launch lidar_perception two_lidars.launch.py left:=/lidar_left/points \
         right:=/lidar_right/points detectors:=pointpillars
+
+The other arguments of detectors.launch.py are valid for both sensors.
 """
 
 from pathlib import Path
@@ -14,51 +16,30 @@ from launch import LaunchDescription
 from lidar_perception.nodes.launching import ARGUMENTS, find_argument_names, reject_unknown_arguments
 
 GRAPH = Path(__file__).resolve().parent / "detectors.launch.py"
-SIDES = ("left", "right")
+SIDES = {
+    side: dict(
+        default_value="points", description=f"Topic of the clouds, in the namespace {side} unless it starts with /."
+    )
+    for side in ("left", "right")
+}
 SHARED = {
-    "detectors": "candidates",
-    "single": "false",
-    "tracking": "false",
-    "processes": "auto",
-    "respawn": "false",
-    "rviz": "false",
-    "rviz_frame": "",
-    "base_frame": "",
-    "target_frame": "",
-    "deskew": "",
-    "range": "",
-    "odometry": "odom",
-    "use_sim_time": "",
-    "log_level": "info",
+    "detectors": dict(default_value="candidates", description="See detectors.launch.py."),
+    **{name: options for name, options in ARGUMENTS.items() if name not in ("namespace", "points")},
 }
 
 
 def generate_launch_description():
     argument_names = find_argument_names()
-    valid_names = {*SIDES, *SHARED, *ARGUMENTS} - {"namespace", "points"}
     return LaunchDescription(
         [
-            OpaqueFunction(function=lambda context: reject_unknown_arguments(argument_names, context, valid_names)),
-            *(
-                DeclareLaunchArgument(
-                    side,
-                    default_value="points",
-                    description=f"Topic of the clouds, in the namespace {side} unless it starts with /.",
-                )
-                for side in SIDES
+            OpaqueFunction(
+                function=lambda context: reject_unknown_arguments(argument_names, context, {**SIDES, **SHARED})
             ),
-            *(
-                DeclareLaunchArgument(name, default_value=value, description="See detectors.launch.py.")
-                for name, value in SHARED.items()
-            ),
+            *(DeclareLaunchArgument(name, **options) for name, options in {**SIDES, **SHARED}.items()),
             *(
                 IncludeLaunchDescription(
                     PythonLaunchDescriptionSource(str(GRAPH)),
-                    launch_arguments={
-                        "namespace": side,
-                        "points": LaunchConfiguration(side),
-                        **{name: LaunchConfiguration(name) for name in SHARED},
-                    }.items(),
+                    launch_arguments={"namespace": side, "points": LaunchConfiguration(side)}.items(),
                 )
                 for side in SIDES
             ),

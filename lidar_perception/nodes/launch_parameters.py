@@ -17,19 +17,11 @@ from lidar_perception.wire.clouds import diagnose_packets, find_cloud_topics
 CONFIGS = {"candidates": "perception", "pointpillars": "pointpillars", "pointnet": "pointnet", "fused": "fused"}
 
 
-def list_parameter_files(config: str, experts: str = "") -> list[str]:
-    """Return the parameter files among the values of `config` and `experts`.
-
-    Raises:
-        InputError: a file does not exist.
-    """
+def list_parameter_files(config: str) -> list[str]:
+    """Return the files in the launch argument `config`. Raises InputError if one does not exist."""
     files = [config] if Path(config).is_file() else [f for f in config.split(",") if f]
     if missing := [file for file in files if not Path(file).is_file()]:
         raise InputError(f"config: parameter file not found: {missing[0]}")
-    if experts and experts not in CONFIGS:
-        if not Path(experts).is_file():
-            raise InputError(f"experts: {experts} is neither a parameter file nor a detector ({', '.join(CONFIGS)})")
-        files.append(experts)
     return files
 
 

@@ -1,4 +1,4 @@
-"""Arguments and nodes of the launch files; the nodes share one process or have one each.
+"""Arguments and nodes of the launch files. The nodes run in one process, or each in its own.
 
 The parameters of a node come from the package's own file, then from the user's files, then from the
 other launch arguments; later values override earlier ones.
@@ -46,8 +46,6 @@ from lidar_perception.nodes.launch_parameters import (
 )
 from lidar_perception.nodes.node_parameters import find_node_parameters
 from lidar_perception.nodes.param_files import EVERY_NODE, describe_unknown_nodes, is_for, read_sections
-from lidar_perception.param_fields import flatten
-from lidar_perception.params import ClusteringNodeParams, GroundNodeParams
 from lidar_perception.types import InputError, make_unknown_name_error
 from lidar_perception.wire.topics import ODOMETRY, POINTS
 
@@ -95,12 +93,6 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "config": dict(
         default_value="",
         description="Comma-separated parameter files for all nodes, loaded after config/*.param.yaml of each detector.",
-    ),
-    "experts": dict(
-        default_value="",
-        description="Parameters of ground segmentation and clustering: name of the "
-        "detector whose config/*.param.yaml they use (empty: the first one), or a "
-        "parameter file that is loaded last.",
     ),
     "weights": dict(
         default_value="",
@@ -162,19 +154,19 @@ def make_launch_description(config_folder: Path, detectors: str) -> LaunchDescri
         reject_unknown_arguments(argument_names, context, ["detectors", *ARGUMENTS])
         value = {k: context.perform_substitution(LaunchConfiguration(k)) for k in ("detectors", *ARGUMENTS)}
         processes = create_nodes(value, config_folder)
-        files = list_parameter_files(value["config"], value["experts"])
-        lines = [
-            f"warning: {line}" for file in files for line in describe_unknown_nodes(file, _build_launch_graph(value))
+        graph = _build_launch_graph(value)
+        warnings = [
+            line for file in list_parameter_files(value["config"]) for line in describe_unknown_nodes(file, graph)
         ]
-        lines += describe_conflicts(value, config_folder)
-        return [*(LogInfo(msg=line) for line in lines), *processes]
+        return [*(LogInfo(msg=f"warning: {line}") for line in warnings), *processes]
 
     return LaunchDescription(
         [
             DeclareLaunchArgument(
                 "detectors",
                 default_value=detectors,
-                description=f"Comma-separated detectors: {', '.join(DETECTOR_NODES)}.",
+                description=f"Comma-separated detectors: {', '.join(DETECTOR_NODES)}. Ground segmentation and "
+                "clustering use the parameters of the first one.",
             ),
             *(DeclareLaunchArgument(name, **options) for name, options in ARGUMENTS.items()),
             OpaqueFunction(function=make_actions),
@@ -227,7 +219,7 @@ def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:
         for name in detectors
         for node in (SINGLE_PROCESS_NODES if single else DETECTOR_NODES)[name]
     }
-    files |= {node: _list_expert_files(value, config_folder) for node in EXPERTS}
+    files |= {node: [_find_package_file(detectors[0], config_folder), *user_files] for node in EXPERTS}
     files |= {node: [str(config_folder / f"{TRACKER}.param.yaml"), *user_files] for node in find_trackers(detectors)}
     topics = {make_relative(POINTS): value["points"], make_relative(ODOMETRY): value["odometry"]}
     viewer = [_make_rviz_node(value, config_folder)] if value["rviz"] == "true" else []
@@ -276,61 +268,8 @@ def _build_launch_graph(value: dict[str, str]) -> dict[str, dict[str, str]]:
     return add_node_prefix(build_graph(detectors, single, tracking), value["name_prefix"])
 
 
-def describe_conflicts(value: dict[str, str], config_folder: Path) -> list[str]:
-    """Return a line for each detector whose package file has other parameters of ground and clusters
-    than are used; none if the user has chosen a file."""
-    detectors, experts = _parse_detectors(value), value["experts"]
-    if value["single"] == "true":
-        return (
-            ["experts has no effect: with single:=true each detector computes ground and clusters itself"]
-            if experts
-            else []
-        )
-    if experts not in ("", *CONFIGS):
-        return []
-    active_detector, user_files = experts or detectors[0], list_parameter_files(value["config"])
-    params = {
-        name: _read_expert_parameters([_find_package_file(name, config_folder), *user_files])
-        for name in (active_detector, *detectors)
-    }
-    lines = []
-    for name in detectors:
-        differences = [f"{key} {v}" for key, v in params[name].items() if v != params[active_detector][key]]
-        if differences:
-            lines.append(
-                f"ground and clusters use the parameters of {active_detector}; those of {name} differ: "
-                f"{', '.join(differences)}. Choose with experts:=NAME or experts:=FILE"
-            )
-    return lines
-
-
 def _find_package_file(detector: str, config_folder: Path) -> str:
     return str(config_folder / f"{CONFIGS[detector]}.param.yaml")
-
-
-def _list_expert_files(value: dict[str, str], config_folder: Path) -> list[str]:
-    """Return the parameter files of ground segmentation and clustering."""
-    detector = value["experts"] if value["experts"] in CONFIGS else _parse_detectors(value)[0]
-    user_files = list_parameter_files(value["config"], value["experts"])
-    return [_find_package_file(detector, config_folder), *user_files]
-
-
-def _read_expert_parameters(files: list[str]) -> dict[str, Any]:
-    """Return the parameters of ground and clusters that result from these files."""
-    defaults = {
-        key: list(v) if isinstance(v, tuple) else v
-        for group in (GroundNodeParams(), ClusteringNodeParams())
-        for key, v in flatten(group).items()
-        if key.startswith(("ground.", "clustering."))
-    }
-    settings = {
-        key: v
-        for file in files
-        for section, values in read_sections(file).items()
-        if any(is_for(section, node) for node in EXPERTS)
-        for key, v in values.items()
-    }
-    return defaults | {k: v for k, v in settings.items() if k in defaults}
 
 
 def _list_expert_range(value: dict[str, str], files: dict[str, list[str]]) -> list[dict[str, str]]:

@@ -145,40 +145,12 @@ def test_expert_nodes_use_the_range_of_the_detectors(detectors, given, expected,
     assert (last.get("range") if isinstance(last, dict) else None) == expected
 
 
-def test_ground_and_clustering_file_depends_on_experts(launched, tmp_path):
-    nodes = launched("detectors")
-    mine = tmp_path / "mine.yaml"
-    mine.write_text("")
-    for detectors, experts, stem, words in (
-        ("pointnet,pointpillars", "", "pointnet", ["ground.method patchwork"]),
-        ("pointpillars,pointnet", "", "pointpillars", ["clustering.euclidean.gamma 0.0"]),
-        ("pointpillars,pointnet", "pointnet", "pointnet", ["ground.method patchwork"]),
-        ("pointpillars,pointnet", str(mine), "pointpillars", []),
-        (
-            "candidates,pointnet,pointpillars",
-            "",
-            "perception",
-            ["ground.method cloth", "clustering.dbscan.eps [0.5, 0.7, 1.0]"],
-        ),
-        ("pointnet", "", "pointnet", []),
-    ):
-        started = nodes(detectors=detectors, experts=experts)
-        files = {name: Path(node.parameters[0]).name.split(".")[0] for name, node in started.items()}
-        assert files["ground_segmentation"] == files["clustering"] == stem
-        assert all(files[f"{name}_detector"] == name for name in detectors.split(",") if name != "candidates")
-        assert all(
-            (str(mine) in started[name].parameters) == (experts == str(mine))
-            for name in ("ground_segmentation", "clustering")
-        )
-        assert len(nodes.messages) == len(words)
-        assert all(word in line for word, line in zip(words, nodes.messages, strict=True))
-    mine.write_text("/**: {ros__parameters: {ground: {method: patchwork}}}")
-    started = nodes(detectors="pointnet,pointpillars", config=str(mine), experts="pointpillars")
-    assert started["pointnet_detector"].parameters[1] == str(mine)
-    assert started["clustering"].parameters[0].endswith("pointpillars.param.yaml")
-    assert "ground.method" not in nodes.messages[0]  # which is the same for both
-    nodes(single="true", experts="pointnet")
-    assert "has no effect" in nodes.messages[0]
+@pytest.mark.parametrize("detectors", ["pointnet,pointpillars", "pointpillars,pointnet"])
+def test_first_detector_sets_parameters_of_ground_and_clusters(detectors, launched):
+    started = launched("detectors")(detectors=detectors)
+    files = {name: Path(node.parameters[0]).name.split(".")[0] for name, node in started.items()}
+    assert files["ground_segmentation"] == files["clustering"] == detectors.split(",")[0]
+    assert all(files[f"{name}_detector"] == name for name in detectors.split(","))
 
 
 def test_arguments_override_user_file_and_defaults(launched, tmp_path):
@@ -367,7 +339,6 @@ def test_replay_connects_player_nodes_and_evaluator(detectors, single, launched,
         ({"detectors": SEVERAL, "weights": "w.safetensors"}, "NAME=FILE"),
         ({"detectors": SEVERAL, "weights": "v5=w"}, "'v5' is not one of"),
         ({"config": "all.yaml"}, "config: parameter file not found: all.yaml"),
-        ({"experts": "pointnets"}, "pointnets is neither a parameter file nor a detector"),
     ],
 )
 def test_unusable_launch_argument_is_rejected(given, words, launched):
