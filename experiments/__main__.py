@@ -19,7 +19,7 @@ def cli() -> None:
 
     \b
     Examples:
-      ./lidar compare /data/kitti/object --png compare.png
+      ./lidar compare /data/kitti/object --json compare.json
       ./lidar realism /data/kitti/object --png realism.png
       ./lidar reproduce stm-cpa /data/kitti/object --out report
     """

@@ -33,7 +33,6 @@ HOSTS = ("127.0.0.1", "localhost")
 PAGE = Path(__file__).with_name("page")
 MAX_REQUEST_BYTES = 10**7
 MAX_QUEUED_EVENTS = 1000
-PREFETCH_FRAMES = 2  # frames to prefetch on each side of the requested one
 EventQueue = asyncio.Queue[dict[str, Any] | None]  # events for one page; None disconnects a page that is too slow
 HEADERS = {
     "Cache-Control": "no-store",
@@ -115,7 +114,6 @@ class Server:
         self.cloud_pool = ThreadPoolExecutor(2, "cloud")
         self.action_pool = ThreadPoolExecutor(1, "action")  # a single thread, because actions run in order
         self.pages: set[EventQueue] = set()
-        self.prefetching_frames: set[int] = set()
         self.app = web.Application(middlewares=[self.check_request], client_max_size=MAX_REQUEST_BYTES)
         self.app.add_routes(
             [
@@ -183,22 +181,10 @@ class Server:
         return int(text)
 
     async def send_cloud(self, request: web.Request) -> web.StreamResponse:
-        """Send the points of a frame, and prefetch the neighbouring frames."""
-        i, drive = self.parse_frame(request.match_info["i"]), self.content.drive
-        load_scan = drive.load_scan
+        """Send the points of a frame."""
+        i, load_scan = self.parse_frame(request.match_info["i"]), self.content.drive.load_scan
         body = await self.run_in_thread(lambda: load_scan(i).encode())
-        margin = 0 if self.content.live else PREFETCH_FRAMES
-        for neighbour in range(max(i - margin, drive.first), min(i + margin + 1, drive.end)):
-            if neighbour not in self.prefetching_frames:
-                self.prefetching_frames.add(neighbour)
-                future = asyncio.get_running_loop().run_in_executor(self.cloud_pool, load_scan, neighbour)
-                future.add_done_callback(partial(self._finish_prefetch, neighbour))
         return web.Response(body=body, content_type="application/octet-stream")
-
-    def _finish_prefetch(self, frame: int, future: asyncio.Future[Any]) -> None:
-        self.prefetching_frames.discard(frame)
-        if not future.cancelled():
-            future.exception()  # avoids a warning; a request for the frame raises the exception again
 
     async def run_in_thread(self, function: Callable[[], Any]) -> Any:
         """Run a function in a thread, so that it does not block the event loop, and return its result."""

@@ -9,14 +9,7 @@ from pathlib import Path
 import click
 
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import (
-    ScoringOptions,
-    intervals_option,
-    no_labels_error,
-    out_file_option,
-    path_option,
-    scoring_options,
-)
+from lidar_perception.cli.data import ScoringOptions, intervals_option, no_labels_error, path_option, scoring_options
 from lidar_perception.cli.options import (
     Algorithm,
     Settings,
@@ -42,19 +35,12 @@ def _list_algorithms() -> list[Algorithm]:
     "Additional detector: weights of PointPillars or PointNet, or your own class, module:Class. May be repeated.",
     multiple=True,
 )
-@out_file_option("--png", "Draw F1 and mean AP against time.")
 @intervals_option
 @range_option
 @device_option
 @settings_options(lambda options: _list_algorithms(), candidates=True)
 def compare(
-    options: ScoringOptions,
-    weights: tuple[Path, ...],
-    png: Path | None,
-    range: str,
-    device: str,
-    settings: Settings,
-    intervals: int,
+    options: ScoringOptions, weights: tuple[Path, ...], range: str, device: str, settings: Settings, intervals: int
 ) -> None:
     """Run all detectors on the same frames, in rotating order, and print scores and times side by side.
 
@@ -65,13 +51,13 @@ def compare(
 
     \b
     Examples:
-      ./lidar compare /data/kitti/object --json compare.json --png compare.png
+      ./lidar compare /data/kitti/object --json compare.json
       ./lidar compare /data/kitti/tracking --intervals 200
       ./lidar compare training_data --weights v4.safetensors --limit 100
     """
     from experiments.comparison.contenders import open_available_contenders, open_contenders
     from experiments.comparison.outcomes import ComparisonReport, start_comparison
-    from experiments.comparison.report import draw_comparison, print_comparison
+    from experiments.comparison.report import print_comparison
     from lidar_perception.data.frame import BOXES
     from lidar_perception.runs.machine import read_cpu_name
     from lidar_perception.scoring.kitti.tables import CENTRE_F1
@@ -106,6 +92,3 @@ def compare(
     }
     print_comparison(content, console)
     options.write(content)
-    if png is not None:
-        draw_comparison(png, content)
-        console.print(f"figure: {png}")

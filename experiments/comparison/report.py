@@ -1,12 +1,7 @@
-"""Tables and figure of the comparison of all detectors."""
+"""Tables of the comparison of all detectors."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy as np
 from rich.console import Console
 from rich.text import Text
 
@@ -16,7 +11,6 @@ from lidar_perception.scoring.intervals import INTERVAL_PERCENT
 from lidar_perception.scoring.kitti.protocol import RELAXED, SCORED, STRICT
 from lidar_perception.scoring.kitti.report import INTERVALS
 from lidar_perception.scoring.kitti.tables import CENTRE_F1
-from lidar_perception.scoring.pictures import save_picture
 from lidar_perception.scoring.tables import (
     format_counts,
     format_interval,
@@ -26,18 +20,7 @@ from lidar_perception.scoring.tables import (
     print_skipped,
 )
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 SHORT_NAMES = {"bev": "BEV", "3d": "3D", "bev_relaxed": "BEV", "3d_relaxed": "3D"}
-FAMILIES = {  # prefix of a name -> colour (Okabe and Ito, 2008) and marker; the first match is used
-    "STM-CPA +": ("#cc79a7", "D"),
-    "PP ": ("#cc79a7", "D"),
-    "STM-CPA": ("#009e73", "s"),
-    "PointPillars": ("#0072b2", "o"),
-    "PointNet": ("#d55e00", "^"),
-    "fused": ("#000000", "*"),
-}
 
 
 def print_comparison(content: dict, console: Console) -> None:
@@ -157,126 +140,3 @@ def _print_intervals(content: dict, console: Console) -> None:
         )
     table.caption = "AP: moderate labels. F1: pedestrians at the default threshold."
     console.print(table)
-
-
-def draw_comparison(path: str | Path, content: dict) -> None:
-    """Write a PNG of pedestrian F1 and mean 3D AP against time per frame.
-
-    Raises:
-        InputError: The file cannot be written.
-    """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    rows = {name: row for name, row in content["rows"].items() if row["ms"] is not None}
-    centres = content["pedestrians"]
-    figure, (left, right) = plt.subplots(1, 2, figsize=(15, 6.4), dpi=120, layout="constrained")
-    _draw(
-        left,
-        {
-            name: (
-                row["ms"],
-                100 * row["pedestrian_centres"]["operating"]["f1"],
-                100 * row["pedestrian_centres"]["best"]["f1"],
-            )
-            for name, row in rows.items()
-        },
-        "filled: default threshold, hollow: best threshold",
-        left_margin=0.31,
-    )
-    left.set(
-        title=f"F1 of {centres['ground_truth']} pedestrians in {centres['frames']} frames", ylabel="F1 within 1.0 m [%]"
-    )
-    for value in dict.fromkeys(round(100 * f1) for f1 in CENTRE_F1.values()):
-        names = [name for name, f1 in CENTRE_F1.items() if round(100 * f1) == value]
-        left.axhline(value, color="#bbbbbb", linewidth=0.8, linestyle=":", zorder=0)
-        left.annotate(
-            f"paper: {', '.join(names)}",
-            (0.01, value),
-            fontsize=7,
-            color="#888888",
-            xycoords=("axes fraction", "data"),
-            va="bottom",
-        )
-    _draw(
-        right,
-        {
-            name: (row["ms"], row["mean_ap"]["3d"], row["mean_ap"]["3d_relaxed"])
-            for name, row in rows.items()
-            if row["mean_ap"]["3d"] is not None
-        },
-        "filled: overlap 0.7 (Car) and 0.5, hollow: 0.5 and 0.25",
-    )
-    right.set(title=f"Mean 3D AP, moderate, {content['frames']} frames", ylabel="mean AP of three classes [%]")
-    save_picture(path, figure)
-
-
-def _draw(axes: Axes, points: dict[str, tuple[float, float, float]], legend: str, left_margin: float = 0.0) -> None:
-    """Draw points (ms, value, other value) on a logarithmic time axis, with their names at the right.
-
-    Args:
-        axes: Matplotlib axes.
-        points: Points by name.
-        legend: Meaning of filled and hollow markers.
-        left_margin: Fraction of the axis that is kept free at the left.
-    """
-    axes.set(xscale="log", xlabel=f"ms per frame, median ({legend})", ylim=(-3, 103))
-    axes.grid(color="#eeeeee", which="both", linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    if not points:
-        text = "no detector supports all three classes"
-        axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", color="#888888")
-        return
-    ms = [x for x, _, _ in points.values()]
-    low, high = min(ms) / 1.6, max(ms) * 1.6
-    axes.set_xlim(low / (high / low) ** (left_margin / (1 - left_margin)), high)
-    axes.xaxis.set_major_locator(_make_ticks(*axes.get_xlim()))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter("")
-    heights = spread_heights([y for _, y, _ in points.values()], -2, 102, 4.0)
-    for (name, (x, y, other_y)), height in zip(points.items(), heights):
-        color, marker = next(style for prefix, style in FAMILIES.items() if name.startswith(prefix))
-        axes.plot([x, x], [y, other_y], color=color, linewidth=0.8, alpha=0.6)
-        axes.plot(x, other_y, marker, color=color, markerfacecolor="white", markersize=6)
-        axes.plot(x, y, marker, color=color, markersize=6)
-        axes.annotate(
-            f"{name}  {y:.1f}",
-            (x, y),
-            (1.03, height),
-            fontsize=8,
-            color=color,
-            textcoords=("axes fraction", "data"),
-            va="center",
-            annotation_clip=False,
-            arrowprops=dict(
-                arrowstyle="-", color=color, linewidth=0.4, alpha=0.5, relpos=(0, 0.5), shrinkA=1, shrinkB=3
-            ),
-        )
-
-
-def _make_ticks(low: float, high: float):
-    from matplotlib.ticker import FixedLocator
-
-    steps = (1, 2, 5) if high < 1e3 * low else (1, 3)  # tick positions whose labels do not overlap
-    return FixedLocator(
-        [step * 10.0**power for power in range(-3, 7) for step in steps if low <= step * 10.0**power <= high]
-    )
-
-
-def spread_heights(values: Sequence[float], low: float, high: float, gap: float) -> np.ndarray:
-    """Return heights (N,) close to the values (N,), in the same order and between low and high.
-
-    They are at least `gap` apart, or less if there is not enough room for all. N is at least 1.
-    """
-    from sklearn.isotonic import isotonic_regression
-
-    count = len(values)
-    gap = min(gap, (high - low) / max(count - 1, 1))
-    order, heights = np.argsort(values, kind="stable"), np.empty(count)
-    # After the gaps are subtracted, the heights only need to be non-decreasing.
-    level = isotonic_regression(np.asarray(values, float)[order] - gap * np.arange(count))
-    heights[order] = np.clip(level, low, high - gap * (count - 1)) + gap * np.arange(count)
-    return heights

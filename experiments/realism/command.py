@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from experiments.realism.compare import compare_scans, measure_scans, select_frames
-from experiments.realism.report import draw_realism, print_realism
+from experiments.realism.report import print_realism
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.cli.command import Command
@@ -47,22 +47,14 @@ from lidar_perception.simulation.sensor import find_sensor
     help="Number of pedestrians and cyclists relative to the default.",
 )
 @out_file_option("--json", "Write all curves to this file.")
-@out_file_option("--png", "Draw all curves into this file.")
 def realism(
-    data: Path,
-    sensor: str,
-    mount_height: float,
-    frames: int,
-    seed: int,
-    people: float,
-    json: Path | None,
-    png: Path | None,
+    data: Path, sensor: str, mount_height: float, frames: int, seed: int, people: float, json: Path | None
 ) -> None:
     """Compare scans of simulated streets with the labelled scans of DATA, curve by curve.
 
     \b
     Example:
-      ./lidar realism /data/kitti/object --png realism.png
+      ./lidar realism /data/kitti/object --json realism.json
     """
     model = find_sensor(sensor, mount_height)
     recording = open_and_describe(data)
@@ -75,6 +67,3 @@ def realism(
     content = {"data": str(data), "seed": seed, **compare_scans(real, simulated)}
     print_realism(content, console)
     write_json(json, content)
-    if png:
-        draw_realism(png, content)
-        console.print(f"picture: {png}")

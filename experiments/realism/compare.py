@@ -180,7 +180,7 @@ def compute_factor(bin_row: dict) -> float:
 
 def _compare_bins(curve: Curve, name: str, real: dict, simulated: dict) -> dict:
     ratio, is_right, is_plausible = compute_ratio(simulated["median"], real["median"]), None, None
-    if real["n"] >= MIN_SAMPLES and not curve.histogram:
+    if real["n"] >= MIN_SAMPLES:
         is_right = is_plausible = ratio is not None and RATIO_LIMITS[0] <= ratio <= RATIO_LIMITS[1]
         if simulated["n"]:
             difference = abs(simulated["median"] - real["median"])
@@ -209,15 +209,12 @@ def _count_verdicts(bins: list[dict]) -> dict:
 
 def _make_bins(rows: list[np.ndarray], curve: Curve) -> list[dict]:
     table = np.array(rows, float).reshape(-1, len(curve.bins))
-    return [_summarize_bin(column[~np.isnan(column)], curve.histogram) for column in table.T]
+    return [_summarize_bin(column[~np.isnan(column)]) for column in table.T]
 
 
-def _summarize_bin(values: np.ndarray, histogram: bool) -> dict:
-    """Summarize the samples of a bin. A histogram gets the mean, so that its bins add up to 1."""
+def _summarize_bin(values: np.ndarray) -> dict:
     if len(values) == 0:
         return _make_row(0, None)
-    if histogram:
-        return _make_row(len(values), float(values.mean()))
     low, median, high = np.quantile(values, (0.1, 0.5, 0.9)).tolist()
     return _make_row(len(values), median, low, high, compute_median_interval(values))
 

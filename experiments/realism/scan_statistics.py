@@ -34,7 +34,6 @@ RANGES = np.array([0.0, 5, 10, 15, 20, 30, 40, 60, 80, np.inf])
 OBJECT_RANGES = np.array([0.0, 10, 20, 30, 45, 60])
 ELEVATIONS = np.arange(-26.0, 4.1, 2.0)
 QUANTILES = (5, 25, 50, 75, 95)
-INTENSITIES = np.arange(20) * 0.05 - 0.005  # bin edges between the steps of KITTI's reflectance
 INTENSITY_STEP = 0.01
 ROUGH_STEP_M = 0.002  # smaller differences in roughness are ignored
 BELT_HEIGHT = 0.65  # fraction of an object's height above which a car has windows
@@ -58,30 +57,22 @@ class Curve:
         title: Name of the quantity, with its unit.
         bins: Names of the bins.
         axis: Label of the axis of the bins.
-        log_scale: True to draw the values on a logarithmic scale.
         step: Resolution. Smaller differences are ignored.
-        histogram: True if the values are the fractions of a histogram. Their mean is shown, and they
-            are not judged.
     """
 
     title: str
     bins: tuple[str, ...]
     axis: str = "range [m]"
-    log_scale: bool = False
     step: float = 0.0
-    histogram: bool = False
 
 
 _BY_RANGE, _BY_OBJECT_RANGE = _name_bins(RANGES), _name_bins(OBJECT_RANGES)
 _BY_QUANTILE = tuple(f"{q}%" for q in QUANTILES)
-_BY_INTENSITY = tuple(f"{i * 0.05:.2f}" for i in range(20))
 _SURFACES = ("ground", "above ground", *CLASSES)
 CURVES = {
     "scan points": Curve("points per scan", ("all",), ""),
-    "points": Curve("points", _BY_RANGE, log_scale=True),
-    "elevation": Curve(
-        "points", tuple(f"{a:g}..{a + 2:g}" for a in ELEVATIONS[:-1]), "elevation [deg]", log_scale=True
-    ),
+    "points": Curve("points", _BY_RANGE),
+    "elevation": Curve("points", tuple(f"{a:g}..{a + 2:g}" for a in ELEVATIONS[:-1]), "elevation [deg]"),
     "ground share": Curve("fraction of points on the ground", _BY_RANGE),
     "roughness": Curve("scatter about the ground of 1 m2, 75 % [m]", _BY_RANGE, step=ROUGH_STEP_M),
     "neighbour": Curve("distance to the nearest point [m]", _BY_RANGE),
@@ -93,13 +84,7 @@ CURVES = {
         for surface in _SURFACES
     },
     **{
-        f"{surface} intensity histogram": Curve(
-            f"fraction of points, {surface}", _BY_INTENSITY, "intensity", histogram=True
-        )
-        for surface in _SURFACES
-    },
-    **{
-        f"{name} {quantity}": Curve(f"{name}: {title}", _BY_OBJECT_RANGE, log_scale="points" in quantity)
+        f"{name} {quantity}": Curve(f"{name}: {title}", _BY_OBJECT_RANGE)
         for name in CLASSES
         for quantity, title in (
             ("points", "points, not occluded"),
@@ -248,11 +233,5 @@ def _measure_neighbours(xyz: np.ndarray, point_bins: np.ndarray) -> np.ndarray:
 
 
 def _describe_intensity(name: str, values: np.ndarray) -> dict:
-    """Return the quantiles and the histogram of intensities (N,)."""
-    if len(values) == 0:
-        return {}
-    count = np.bincount(np.maximum(_find_bins(values, INTENSITIES), 0), minlength=len(INTENSITIES))
-    return {
-        f"{name} intensity": np.quantile(values, np.array(QUANTILES) / 100),
-        f"{name} intensity histogram": count / len(values),
-    }
+    """Return the quantiles of intensities (N,)."""
+    return {f"{name} intensity": np.quantile(values, np.array(QUANTILES) / 100)} if len(values) else {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 import click
@@ -74,25 +74,20 @@ class Command(click.Command):
                 for flag in (*param.opts, *param.secondary_opts)
                 if flag.startswith("-")
             ]
-            remedy = self._suggest_remedy(error.option_name) or suggest_name(error.option_name, flags)
-            raise click.UsageError(
-                f"no such option {error.option_name}" + (remedy or f"; {ctx.command_path} --help lists them"), ctx
-            ) from None
-
-    def _suggest_remedy(self, flag: str) -> str:
-        """Return an option's suggestion for an unknown flag; "" if there is none."""
-        return next(
-            (
-                text
-                for param in self.params
-                if isinstance(param, HelpfulOption) and (text := param.suggest_option(flag))
-            ),
-            "",
-        )
+            remedy = suggest_name(error.option_name, flags) or f"; {ctx.command_path} --help lists them"
+            raise click.UsageError(f"no such option {error.option_name}{remedy}", ctx) from None
 
 
 class HelpfulOption(click.Option):
-    """An option whose possible values are listed by `--NAME help`."""
+    """An option whose possible values are listed by `--NAME help`.
+
+    Args:
+        list_values: Function from the other options to the text that lists the possible values.
+    """
+
+    def __init__(self, *args: Any, list_values: Callable[[Mapping[str, Any]], str], **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.list_values = list_values
 
     def asks_for_help(self, args: list[str]) -> bool:
         """Return True if the command line asks for the listing."""
@@ -100,14 +95,6 @@ class HelpfulOption(click.Option):
             f"{flag}=help" in args or [flag, "help"] in [args[i : i + 2] for i in range(len(args))]
             for flag in self.opts
         )
-
-    def list_values(self, options: Mapping[str, Any]) -> str:
-        """Return the text that lists the possible values, given the other options."""
-        raise NotImplementedError
-
-    def suggest_option(self, flag: str) -> str:
-        """Return a suggestion for an unknown flag that this option replaces; "" for other flags."""
-        return ""
 
 
 class Group(click.Group):

@@ -22,7 +22,6 @@ from lidar_perception.detectors.contract import FUSED
 from lidar_perception.detectors.open import DetectorChoice, make_default_params
 from lidar_perception.detectors.params import RANGE_CHOICES
 from lidar_perception.nodes import NODES
-from lidar_perception.nodes.node_parameters import find_node_parameters
 from lidar_perception.param_fields import collect_fields, describe_fields, with_values
 from lidar_perception.runs.terminal import errors
 from lidar_perception.tracking.params import TrackingParams
@@ -118,32 +117,6 @@ class Assignment(click.ParamType):
         return name.removesuffix(":").strip(), text
 
 
-class SetOption(HelpfulOption):
-    """The option --set.
-
-    Args:
-        select: Function from the other options to the algorithms that they select.
-    """
-
-    def __init__(self, *args: Any, select: Callable[[Mapping[str, Any]], list[Algorithm]], **kwargs: Any):
-        super().__init__(*args, **kwargs)
-        self.select = select
-
-    def list_values(self, options: Mapping[str, Any]) -> str:
-        return "\n".join(
-            line
-            for algorithm in self.select(options)
-            for line in (f"Parameters of {algorithm.name}:", *describe_fields(algorithm.fields))
-        )
-
-    def suggest_option(self, flag: str) -> str:
-        parameter = flag.removeprefix("--").removeprefix("no-")
-        names_by_flag = {
-            name.replace(".", "-").replace("_", "-"): name for node in NODES for name in find_node_parameters(node)
-        }
-        return f"; parameters are given as --set {names_by_flag[parameter]}=VALUE" if parameter in names_by_flag else ""
-
-
 def settings_options(
     select: Callable[[Mapping[str, Any]], list[Algorithm]],
     example: str = "fused.scores.car=0.7",
@@ -158,6 +131,13 @@ def settings_options(
     """
     config_note = f" Or one of {', '.join(CONFIGURATIONS)}, for the candidates." if candidates else ""
 
+    def list_parameters(options: Mapping[str, Any]) -> str:
+        return "\n".join(
+            line
+            for algorithm in select(options)
+            for line in (f"Parameters of {algorithm.name}:", *describe_fields(algorithm.fields))
+        )
+
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
         def wrapper(*args: Any, config: Path | None, assignments: tuple, **kwargs: Any) -> Any:
@@ -166,8 +146,8 @@ def settings_options(
         wrapper = click.option(
             "--set",
             "assignments",
-            cls=SetOption,
-            select=select,
+            cls=HelpfulOption,
+            list_values=list_parameters,
             multiple=True,
             type=Assignment(),
             metavar="NAME=VALUE",

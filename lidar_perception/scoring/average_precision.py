@@ -7,7 +7,7 @@ KITTI's own program samples 41 points from the scores of the true positives, eac
 once. With fewer objects than points some points remain empty: if all n objects are detected, the
 result is (n - 1) / 40 instead of 1. For fewer than 41 objects, the points are therefore sampled
 from the complete curve here, according to the definition above. For 41 or more objects the result
-is the same as from KITTI's program. official=True always gives the result of KITTI's program.
+is the same as from KITTI's program.
 """
 
 from __future__ import annotations
@@ -40,17 +40,16 @@ def choose_thresholds(scores: np.ndarray, objects: int) -> np.ndarray:
     return sorted_scores[indices[:MIN_OBJECTS]]
 
 
-def sample_curve(values: np.ndarray, objects: int, official: bool = False) -> np.ndarray:
+def sample_curve(values: np.ndarray, objects: int) -> np.ndarray:
     """Return the highest value (41,) at or above each recall 0, 1/40, .. 1. It is 0 at recalls that are not reached.
 
     Args:
         values: (T,) value at each threshold of choose_thresholds.
         objects: Number of labelled objects.
-        official: True to sample like KITTI's program even if there are few objects.
     """
     best_values = np.maximum.accumulate(values[::-1])[::-1]
     curve = np.zeros(MIN_OBJECTS)
-    if objects >= MIN_OBJECTS or official:
+    if objects >= MIN_OBJECTS:
         curve[: len(best_values)] = best_values
         return curve
     # Index of the first true positive that reaches each recall.

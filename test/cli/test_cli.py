@@ -210,11 +210,9 @@ def test_converted_bag_scores_like_its_folder(kitti, bag, tmp_path):
     assert scores(evaluate(tmp_path, "--data", bag)) == scores(evaluate(tmp_path, "--data", kitti))
 
 
-def test_printed_and_written_scores_agree(bag, tmp_path, monkeypatch):
+def test_evaluate_prints_the_number_of_pedestrians(bag, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
-    text = run("evaluate", "candidates", "--data", bag, "--png", tmp_path / "a/picture.png")
-    assert "2 pedestrians in 2 frames" in text
-    assert (tmp_path / "a/picture.png").read_bytes().startswith(b"\x89PNG")
+    assert "2 pedestrians in 2 frames" in run("evaluate", "candidates", "--data", bag)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The command compare: scores, missing detectors and the figure."""
+"""The command compare: scores and missing detectors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from samples import crowd_folder, object_folder, walker_label, write
 from experiments.__main__ import cli, main
 from experiments.comparison.contenders import open_contenders
 from experiments.comparison.outcomes import ComparisonReport, Contender, rotate, start_comparison
-from experiments.comparison.report import spread_heights
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors import weights_file
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
@@ -79,9 +78,9 @@ def copy_labels(frame, score=0.9) -> Detections:
 
 def test_all_detectors_run_and_missing_ones_are_listed(bare, weights, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
-    root, png = crowd_folder(tmp_path / "kitti", 3), tmp_path / "pictures/compare.png"
+    root = crowd_folder(tmp_path / "kitti", 3)
     given = [word for name in "acb" for word in ("--weights", weights / name)]
-    content, text = run(tmp_path, "--data", root, *given, "--png", png, "--device", "cpu")
+    content, text = run(tmp_path, "--data", root, *given, "--device", "cpu")
     assert [*content["rows"]] == [*CANDIDATES, "PointPillars v0 compact", "PointNet", "PointPillars v0 compact #2"]
     assert {each["name"] for each in content["missing"]} == {"fused"} | {
         f"PointPillars v{i} {size}" for i in range(5) for size in ("full", "compact") if (i, size) != (0, "compact")
@@ -99,18 +98,16 @@ def test_all_detectors_run_and_missing_ones_are_listed(bare, weights, tmp_path, 
         assert (row["mean_ap"]["3d"] is None) == name.startswith("STM-CPA")
         assert name in text
     assert content["rows"]["PointPillars v0 compact #2"]["weights"] == str(weights / "b")
-    assert png.read_bytes().startswith(b"\x89PNG")
     assert "missing" in text and "v4 full" in text and "AVOD" in text
     lines = [line for line in text.splitlines() if str(tmp_path) not in line and not line.startswith("missing: ")]
     assert max(map(len, lines)) <= 100 and "…" not in text
 
 
 def test_candidates_are_compared_in_any_layout(bare, tmp_path):
-    content, _ = run(tmp_path, "--data", tracking_folder(tmp_path / "kitti"), "--limit", 2, "--png", tmp_path / "a.png")
+    content, _ = run(tmp_path, "--data", tracking_folder(tmp_path / "kitti"), "--limit", 2)
     assert [*content["rows"]] == CANDIDATES and content["frames"] == 2
     reasons = {each["name"]: each["reason"] for each in content["missing"]}
     assert len(reasons) == 12 and "--weights" in reasons["PointNet"]
-    assert (tmp_path / "a.png").stat().st_size > 0
     frame, _ = open_recording(crowd_folder(tmp_path / "crowd", 2))  # like a bag without a camera
     found, _ = open_contenders([], "cpu", 1.73)
     scan, blind = frame.load(), replace(frame, calibration=lambda: None)
@@ -180,20 +177,6 @@ def test_mean_ignores_classes_without_labels(tmp_path):
     (row,) = compute_report(root, make_fake(lambda frame: Detections.none()))["rows"].values()
     assert row["mean_ap"] == dict.fromkeys(row["mean_ap"], 0.0)
     assert [row["ap"][name]["3d"]["moderate"] for name in SCORED] == [None, 0.0, None]
-
-
-def test_labels_of_the_figure_do_not_overlap():
-    rng = np.random.default_rng(0)
-    for count in (1, 2, 5, 20, 60):
-        values = rng.choice([rng.uniform(0, 100), 0, 50, 100], count) + rng.normal(0, 2, count)
-        places = spread_heights(values, 0, 100, 4)
-        gaps = np.diff(np.sort(places))
-        assert (gaps > min(4, 100 / max(count - 1, 1)) - 1e-9).all()
-        assert places.min() >= -1e-9 and places.max() <= 100 + 1e-9
-        order = np.argsort(values, kind="stable")
-        assert (np.diff(places[order]) > 0).all()
-    apart = np.array([80.0, 10, 30])
-    np.testing.assert_allclose(spread_heights(apart, 0, 100, 4), apart)
 
 
 @pytest.mark.parametrize("case", ["labels", "weights", "folder"])

@@ -105,9 +105,6 @@ def test_average_precision_of_four_objects_is_exact():
     assert row["r40"] == pytest.approx(100 * (10 * 1 + 10 * 2 / 3 + 10 * 3 / 5) / 40)
     # 11 points: 0 .1 .2; .3 .4 .5; .6 .7; .8 .9 1.
     assert row["r11"] == pytest.approx(100 * (3 * 1 + 3 * 2 / 3 + 2 * 3 / 5) / 11)
-    # KITTI's program assigns the three precisions to the first three of 41 points.
-    assert row["official_r40"] == pytest.approx(100 * (2 / 3 + 3 / 5) / 40)
-    assert row["official_r11"] == pytest.approx(100 * 1 / 11)
     # The second hit is rotated by 90 degrees: similarities 1, 1 + 1/2, 2 + 1/2 of 1, 3, 5.
     aos = ap([(truth, found)])["Car"]["aos"]["easy"]
     assert aos["r40"] == pytest.approx(100 * (10 * 1 + 10 * 1.5 / 3 + 10 * 2.5 / 5) / 40)
@@ -118,10 +115,9 @@ def test_average_precision_equals_hand_computed_value():
     # maximum beyond 1/2.
     frames = [(car(), concatenate(car(score=0.9 - i * 1e-3), car(score=0.5 + i * 1e-4, **WRONG))) for i in range(50)]
     frames += [(car(), car(score=0.4 - i * 1e-3)) for i in range(50)]
-    for key in ("", "official_"):
-        row = ap(frames)["Car"]["bev"]["moderate"]
-        assert row[f"{key}r40"] == pytest.approx(100 * (20 * 1 + 20 * 2 / 3) / 40)
-        assert row[f"{key}r11"] == pytest.approx(100 * (6 * 1 + 5 * 2 / 3) / 11)
+    row = ap(frames)["Car"]["bev"]["moderate"]
+    assert row["r40"] == pytest.approx(100 * (20 * 1 + 20 * 2 / 3) / 40)
+    assert row["r11"] == pytest.approx(100 * (6 * 1 + 5 * 2 / 3) / 11)
 
 
 # A car detected with 0.9 and another detection with 0.95: AP is 100 if the latter is ignored, otherwise 50,

@@ -109,10 +109,10 @@ def drive(ids=(1, 2), frames=10, switch_at=None, kind=CAR):
     return result
 
 
-def scored(frames, similarity="3d", order=None, calibration=None):
+def scored(frames, order=None, calibration=None):
     report = TrackingReport()
     for i in order or range(len(frames)):
-        report.update(make_observation("a", i, *frames[i], calibration, similarity))
+        report.update(make_observation("a", i, *frames[i], calibration))
     return report.compute()["classes"]["Car"]
 
 
@@ -251,8 +251,6 @@ def test_error_explains_why_tracks_cannot_be_scored():
     measure = measure_tracking(lambda: None, TrackingParams(), "none", Recording("a", "", [frame], frozenset()))
     with pytest.raises(InputError, match="no track id"):  # reported before the scan is loaded
         measure(frame)
-    with pytest.raises(InputError, match="requires a camera calibration"):
-        make_pairs(truth, tracks, None, "image")
 
 
 def test_result_file_survives_writing_and_reading(tmp_path):

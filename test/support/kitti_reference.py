@@ -211,7 +211,7 @@ def averages(values):
 
 
 def evaluate(prepared, kind, level, least, metric):
-    """Return objects, r11, r40, aos_r11, aos_r40, official_r11, official_r40; None without objects."""
+    """Return objects, r11, r40, aos_r11, aos_r40; None without objects."""
     objects, scores = first_pass(prepared, kind, level, least)
     if objects == 0:
         return None
@@ -219,22 +219,16 @@ def evaluate(prepared, kind, level, least, metric):
     def at(threshold):
         return second_pass(prepared, kind, level, least, metric, threshold)
 
-    official = [at(t) for t in sampled(scores, objects)]
-    official += [(0.0, 0.0)] * (41 - len(official))
     if objects > 40:
-        points = official
+        points = [at(t) for t in sampled(scores, objects)]
+        points += [(0.0, 0.0)] * (41 - len(points))
     else:  # for each recall k / 40, the best of all scores that reach it
         reached = [(n / objects, *at(score)) for n, score in enumerate(scores, 1)]
         points = []
         for k in range(41):
             enough = [row for row in reached if row[0] >= k / 40 - 1e-9]
             points.append((max((row[1] for row in enough), default=0.0), max((row[2] for row in enough), default=0.0)))
-    return (
-        objects,
-        *averages([p for p, _ in points]),
-        *averages([s for _, s in points]),
-        *averages([p for p, _ in official]),
-    )
+    return objects, *averages([p for p, _ in points]), *averages([s for _, s in points])
 
 
 SIZES = {

@@ -38,7 +38,6 @@ class DetectionRequest:
     mount_height: float
     write_results: Path | None
     errors: bool
-    errors_from: float
     intervals: int
 
     @property
@@ -48,8 +47,6 @@ class DetectionRequest:
 
     def check(self) -> None:
         """Raise a UsageError or InputError for options that cannot be combined."""
-        if not self.errors:
-            refuse_options(("errors_from",), "requires --errors")
         if self.detector is None:
             refuse_options(("min_score", "device"), "requires --weights; --results DIR already contains the boxes")
             if self.write_results is not None:
@@ -106,7 +103,7 @@ class DetectionRequest:
         content = {"source": self.source, "keep": self.keep, **report.compute()}
         if self.errors and report.frames:
             comparison = Comparison.concatenate(report.frames)
-            content["errors"] = {name: measure_box_errors(report.frames, name, self.errors_from) for name in SCORED}
+            content["errors"] = {name: measure_box_errors(report.frames, name) for name in SCORED}
             content["reliability"] = {name: measure_reliability(comparison, name) for name in SCORED}
         if self.intervals and report.frames:
             content["intervals"] = report.compute_intervals(self.intervals)
@@ -163,17 +160,7 @@ def _print_scores(content: dict[str, Any]) -> None:
     "Write the detections of --weights as KITTI result files, also for frames without labels.", "--write-results"
 )
 @click.option(
-    "--errors",
-    is_flag=True,
-    help="Also print the box errors by class and range, their effect on AP, and whether scores are calibrated.",
-)
-@click.option(
-    "--errors-from",
-    type=click.FloatRange(0, 1),
-    default=0.2,
-    show_default=True,
-    metavar="SCORE",
-    help="With --errors: minimum score of boxes to analyse.",
+    "--errors", is_flag=True, help="Also print the box errors by class and range, and whether scores are calibrated."
 )
 @intervals_option
 def detection(options: ScoringOptions, **choices: Any) -> None:

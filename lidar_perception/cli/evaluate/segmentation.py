@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import click
@@ -15,7 +13,6 @@ from lidar_perception.cli.data import (
     ScoringOptions,
     data_argument,
     no_labels_error,
-    out_file_option,
     scoring_options,
     with_recorded_height,
 )
@@ -48,11 +45,10 @@ class MethodList(click.ParamType):
     default=GROUND_METHODS + CLUSTERING_METHODS,
     help="Comma-separated ground and clustering methods to score. Default: all.",
 )
-@out_file_option("--png", "Draw a bird's-eye view of the ground of the first scan with labelled points.")
 @parameter_options(
     SegmentationParams(), "segmentation", ("perception", "ground_segmentation", "clustering"), "ground.method=patchwork"
 )
-def segmentation(options: ScoringOptions, methods: tuple, png: Path | None, params: SegmentationParams) -> None:
+def segmentation(options: ScoringOptions, methods: tuple, params: SegmentationParams) -> None:
     """Score ground segmentation and clustering against labels.
 
     Ground methods are scored against the point classes of SemanticKITTI. Clustering methods run on
@@ -61,14 +57,14 @@ def segmentation(options: ScoringOptions, methods: tuple, png: Path | None, para
 
     \b
     Examples:
-      lidar-perception evaluate segmentation /data/semantickitti --png ground.png
+      lidar-perception evaluate segmentation /data/semantickitti
       lidar-perception evaluate segmentation /data/kitti/object \\
           --set ground.method=patchwork
       lidar-perception evaluate segmentation drive.bag --methods dbscan --json scores.json
     """
     from lidar_perception.data.frame import BOXES, POINT_LABELS
     from lidar_perception.scoring.points.report import SegmentationReport, measure_methods
-    from lidar_perception.scoring.points.tables import draw_ground, print_scores
+    from lidar_perception.scoring.points.tables import print_scores
 
     ground_methods = tuple(name for name in GROUND_METHODS if name in methods)
     clustering_methods = tuple(name for name in CLUSTERING_METHODS if name in methods)
@@ -78,8 +74,6 @@ def segmentation(options: ScoringOptions, methods: tuple, png: Path | None, para
     for recording in recordings:
         if recording not in with_point_labels:
             recording.require(BOXES, "evaluate segmentation")
-    if png is not None and not (with_point_labels and ground_methods):
-        raise click.UsageError("--png requires labelled points (SemanticKITTI) and a ground method")
     if not (with_point_labels or clustering_methods):
         raise click.UsageError(
             "ground methods require labelled points: give SemanticKITTI, or choose a clustering method"
@@ -104,13 +98,3 @@ def segmentation(options: ScoringOptions, methods: tuple, png: Path | None, para
         )
     print_scores(content, params.ground.method, console)
     options.write(content)
-    if png is not None:
-        from lidar_perception.scoring.points.report import segment_by_methods
-
-        recording_params = with_recorded_height(with_point_labels[0], params)
-        for frame in islice(with_point_labels[0], options.limit):
-            scan, labels, ground_masks = segment_by_methods(frame, recording_params, ground_methods)
-            if labels is not None:
-                draw_ground(png, frame.name, scan, labels.classes, ground_masks)
-                break
-        console.print(f"picture: {png}")

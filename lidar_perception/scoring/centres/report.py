@@ -54,14 +54,12 @@ class CandidateResult:
         boxes: (K, 7) candidate boxes by stage.
         ms: Duration of each step.
         problem: Reason why there are no candidates, or None.
-        name: Name of the frame.
     """
 
     truth: np.ndarray
     boxes: dict[str, np.ndarray]
     ms: dict[str, float]
     problem: str | None = None
-    name: str = ""
 
 
 def measure_candidates(params: PipelineParams, recording: Recording) -> Callable[[Frame], CandidateResult | None]:
@@ -89,7 +87,7 @@ def measure_frame(
         _, candidates = find_candidates(scan, make_seed_source(truth, templates, params), camera, params)
     except InputError as error:  # no seed or no camera calibration
         return CandidateResult(truth, collect_boxes(Candidates.none()), {}, f"{frame.name}: {error}")
-    return CandidateResult(truth, collect_boxes(candidates), candidates.ms, name=frame.name)
+    return CandidateResult(truth, collect_boxes(candidates), candidates.ms)
 
 
 def collect_boxes(candidates: Candidates) -> dict[str, np.ndarray]:
@@ -123,7 +121,6 @@ class CandidateReport:
     times: dict[str, deque[float]] = field(default_factory=dict)
     true_by_range: np.ndarray = field(default_factory=lambda: np.zeros(len(RANGE_NAMES), int))
     skipped: list[str] = field(default_factory=list)
-    most_crowded: tuple[int, str | None] = 0, None  # number of pedestrians, name of the frame
 
     def update(self, result: CandidateResult) -> None:
         """Add one frame."""
@@ -131,8 +128,6 @@ class CandidateReport:
             self.skipped.append(result.problem)
         self.frames += 1
         self.true_by_range += np.bincount(find_range_bins(result.truth), minlength=len(RANGE_NAMES))
-        if result.name and len(result.truth) > self.most_crowded[0]:
-            self.most_crowded = len(result.truth), result.name
         for stage, boxes in result.boxes.items():
             self.scores.setdefault(stage, Score()).update(boxes, result.truth)
         if result.ms:

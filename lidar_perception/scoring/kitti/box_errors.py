@@ -1,4 +1,4 @@
-"""Errors of detected boxes, the effect of correcting each error, and a diagnosis of height errors."""
+"""Errors of detected boxes, and a diagnosis of height errors."""
 
 from __future__ import annotations
 
@@ -8,25 +8,14 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from lidar_perception.classes import DETECTED
-from lidar_perception.geometry import bev_and_3d_iou, horizontal_range, wrap_line
+from lidar_perception.geometry import horizontal_range, wrap_line
 from lidar_perception.scoring.kitti.protocol import METRICS, RELAXED, ComparedFrame
 from lidar_perception.scoring.tables import make_table
 from lidar_perception.types import CLASSES
 
 RANGES = (0.0, 15.0, 30.0, 45.0, np.inf)  # limits of the range bins in metres
 ERRORS = ("away", "aside", "bottom", "length", "width", "height", "yaw")
-# Name of each correction -> columns of the box that it corrects.
-CORRECTIONS = {
-    "as it is": [],
-    "z": [2],
-    "x, y": [0, 1],
-    "x, y, z": [0, 1, 2],
-    "length": [3],
-    "width": [4],
-    "height": [5],
-    "yaw": [6],
-}
+MIN_SCORE = 0.2  # minimum score of the boxes to analyse
 MIN_BEV_AP = 20.0  # minimum BEV AP for a diagnosis, in percent
 MIN_AP_RATIO = 4  # minimum ratio of BEV AP to 3D AP if heights are wrong
 MAX_MEDIAN_ERROR = 0.1  # maximum median height error without bias, in metres
@@ -109,7 +98,7 @@ def _describe_heights(matched: dict) -> str:
     return f"{boxes} {abs(z_error):.2f} m too {'high' if z_error > 0 else 'low'} (median); {reason}"
 
 
-def measure_box_errors(frames: list[ComparedFrame], name: str, min_score: float) -> dict[str, Any]:
+def measure_box_errors(frames: list[ComparedFrame], name: str, min_score: float = MIN_SCORE) -> dict[str, Any]:
     """Measure the errors of the matched boxes of a class; see match_boxes.
 
     Returns:
@@ -117,8 +106,6 @@ def measure_box_errors(frames: list[ComparedFrame], name: str, min_score: float)
             `median` and `median_size` (median of absolute values), in metres and radians. Errors
             are detected minus labelled: centre along the ray from the sensor (away) and to the left
             of the ray (aside), bottom, length, width, height, and yaw modulo pi.
-        strict: For each of CORRECTIONS, the percentage of pairs above the strict overlap in 3D
-            (`space`) and in BEV (`above`), None without pairs.
     """
     detected_boxes, label_boxes = match_boxes(frames, name, min_score)
     differences, ranges = _compute_differences(detected_boxes, label_boxes), horizontal_range(label_boxes)
@@ -141,10 +128,6 @@ def measure_box_errors(frames: list[ComparedFrame], name: str, min_score: float)
             }
             for title, mask in masks.items()
         },
-        "strict": {
-            title: _measure_overlaps(detected_boxes, label_boxes, columns, DETECTED[name].strict)
-            for title, columns in CORRECTIONS.items()
-        },
     }
 
 
@@ -165,26 +148,12 @@ def _compute_differences(detected_boxes: np.ndarray, label_boxes: np.ndarray) ->
     )
 
 
-def _measure_overlaps(
-    detected_boxes: np.ndarray, label_boxes: np.ndarray, columns: list[int], min_overlap: float
-) -> dict[str, float | None]:
-    """Return the percentage of pairs above min_overlap after correcting columns of the boxes."""
-    if len(detected_boxes) == 0:
-        return {"space": None, "above": None}
-    corrected_boxes = detected_boxes.copy()
-    corrected_boxes[:, columns] = label_boxes[:, columns]
-    bev, full = np.array(
-        [[iou[0, 0] for iou in bev_and_3d_iou(a[None], b[None])] for a, b in zip(corrected_boxes, label_boxes)]
-    ).T
-    return {"space": 100 * float((full > min_overlap).mean()), "above": 100 * float((bev > min_overlap).mean())}
-
-
 def _compute_median(values: np.ndarray) -> float | None:
     return float(np.median(values)) if len(values) else None
 
 
 def print_box_errors(errors: dict[str, dict[str, Any]], console: Console) -> None:
-    """Print two tables for each class with matched boxes."""
+    """Print a table for each class with matched boxes."""
     for name, content in errors.items():
         if content["by_range"]["all"]["pairs"] == 0:
             continue
@@ -199,12 +168,6 @@ def print_box_errors(errors: dict[str, dict[str, Any]], console: Console) -> Non
             "or more. away, aside: error of the centre along the ray from the sensor, "
             "and to the left of it."
         )
-        console.print(table)
-        table = make_table(
-            f"{name}: pairs above the overlap {DETECTED[name].strict:g}, %", "corrected", *CORRECTIONS, width=7
-        )
-        for view, title in (("space", "3D"), ("above", "BEV")):
-            table.add_row(title, *(f"{row[view]:.0f}" for row in content["strict"].values()))
         console.print(table)
 
 

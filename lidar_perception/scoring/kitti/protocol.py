@@ -155,8 +155,6 @@ class Precision:
         objects: Number of counted labels.
         r11, r40: Average precision over 11 and 40 recall points.
         aos_r11, aos_r40: Average orientation similarity (AOS) over 11 and 40 recall points.
-        official_r11, official_r40: r11 and r40 as KITTI's own program computes them, which differ
-            for few objects.
     """
 
     objects: int
@@ -164,8 +162,6 @@ class Precision:
     r40: float
     aos_r11: float
     aos_r40: float
-    official_r11: float
-    official_r40: float
 
 
 def compute_precision(frames: Comparison, name: str, metric: str, overlap: float, difficulty: str) -> Precision | None:
@@ -193,7 +189,6 @@ def compute_precision(frames: Comparison, name: str, metric: str, overlap: float
         objects,
         *average_curve(sample_curve(precision, objects)),
         *average_curve(sample_curve(orientation_similarity, objects)),
-        *average_curve(sample_curve(precision, objects, official=True)),
     )
 
 

@@ -143,17 +143,7 @@ class DetectionReport:
 
 
 def _to_content(value: Precision | None) -> dict | None:
-    return (
-        None
-        if value is None
-        else {
-            "objects": value.objects,
-            "r11": value.r11,
-            "r40": value.r40,
-            "official_r11": value.official_r11,
-            "official_r40": value.official_r40,
-        }
-    )
+    return None if value is None else {"objects": value.objects, "r11": value.r11, "r40": value.r40}
 
 
 def _to_angle_content(value: Precision | None) -> dict | None:

@@ -1,10 +1,9 @@
-"""Tables of detection scores, with the papers' results."""
+"""Tables of detection scores."""
 
 from __future__ import annotations
 
 from rich.console import Console
 
-from lidar_perception.classes import CAR, CLASSES, CYCLIST, PEDESTRIAN
 from lidar_perception.scoring.average_precision import MIN_OBJECTS
 from lidar_perception.scoring.intervals import INTERVAL_PERCENT
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES
@@ -19,26 +18,14 @@ from lidar_perception.scoring.tables import (
     print_time,
 )
 
-# Table 5 of the EG-PointPillars paper: 3D AP (easy, moderate, hard) at overlap 0.7 for Car and 0.5 for others.
-# The paper does not state the number of recall points.
-COLUMNS = tuple(CLASSES[i] for i in (CAR, CYCLIST, PEDESTRIAN))
-PAPER = {
-    "PointPillars": ((84.00, 72.89, 68.24), (80.57, 61.96, 58.32), (52.66, 47.09, 43.21)),
-    "V1": ((86.94, 76.06, 68.77), (79.53, 61.85, 58.18), (56.12, 50.96, 46.56)),
-    "V2": ((86.16, 76.01, 68.69), (82.79, 65.31, 62.01), (55.68, 50.05, 44.68)),
-    "V3": ((84.23, 74.82, 68.13), (81.37, 64.81, 61.37), (55.60, 50.81, 45.47)),
-    "V4": ((86.69, 76.44, 74.93), (81.21, 66.74, 61.91), (56.73, 52.31, 46.92)),
-}
-PAPER_MAP = {"PointPillars": 63.21, "V1": 65.00, "V2": 65.71, "V3": 65.18, "V4": 67.09}
 # Tables 6 and 7 of the STM-CPA paper: F1 of pedestrians within 1.0 m.
 CENTRE_F1 = {"STM-CPA": 0.521, "PointPillars": 0.52, "AVOD": 0.48, "PointCNN": 0.37, "F-PointNet": 0.33}
 TITLES = {"image": "2D box", "aos": "orientation", "bev": "BEV", "3d": "3D", "bev_relaxed": "BEV", "3d_relaxed": "3D"}
 
 
 def print_detection_report(content: dict, console: Console) -> None:
-    """Print average precision by class and difficulty, the papers' results, and the diagnosis."""
+    """Print average precision by class and difficulty, pedestrian scores, and the diagnosis."""
     _print_precision(content, console)
-    _print_paper(content, console)
     _print_centres(content["pedestrian_centres"], console)
     for line in content["diagnosis"]:
         console.print(line, style="yellow")
@@ -68,22 +55,8 @@ def _print_precision(content: dict, console: Console) -> None:
         "sampling of recall; the full curve is used instead."
     )
     console.print(table)
-
-
-def _print_paper(content: dict, console: Console) -> None:
-    titles = [f"{name[:3]} {level[0].upper()}" for name in COLUMNS for level in DIFFICULTIES]
-    table = make_table("3D AP and Table 5 of the EG-PointPillars paper", "", *titles, "mAP", width=5)
-    for key in ("r40", "r11"):
-        cells = [_format_cell(level, key) for name in COLUMNS for level in _list_levels(content["ap"][name]["3d"])]
-        mean_ap = content["map_3d"]
-        table.add_row(f"here, {key.upper()}", *cells, format_number(mean_ap[key] if mean_ap else None), style="bold")
-    for name, classes in PAPER.items():
-        table.add_row(name, *(f"{v:.2f}" for levels in classes for v in levels), f"{PAPER_MAP[name]:.2f}", style="dim")
-    table.caption = (
-        "Easy, moderate, hard; Car at overlap 0.7, the others at 0.5. The paper does "
-        "not say whether it used 11 or 40 recall points."
-    )
-    console.print(table)
+    if mean_ap := content["map_3d"]:
+        console.print(f"3D AP, mean of classes and difficulties: R40 {mean_ap['r40']:.2f}, R11 {mean_ap['r11']:.2f}")
 
 
 def print_intervals(content: dict[str, dict], console: Console) -> None:

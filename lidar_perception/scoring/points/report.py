@@ -12,7 +12,7 @@ import numpy as np
 from lidar_perception.candidates.segmented_cloud import crop_to_view
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.params import ClusteringParams
-from lidar_perception.data.frame import Frame, PointTruth, Recording
+from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.scoring.points.segmentation import (
@@ -166,15 +166,3 @@ class SegmentationReport:
             },
             "skipped": self.skipped,
         }
-
-
-def segment_by_methods(
-    frame: Frame, params: SegmentationParams, ground_methods: tuple[str, ...]
-) -> tuple[PointCloud, PointTruth | None, dict[str, np.ndarray]]:
-    """Return the cloud of a frame, its point labels, and a ground mask (N,) for each method."""
-    scan = frame.load()
-    return (
-        scan,
-        frame.point_truth(),
-        {name: segment_ground(scan, replace(params.ground, method=name)) for name in ground_methods},
-    )

@@ -1,22 +1,15 @@
-"""Tables of ground and cluster scores, and a picture of the ground."""
+"""Tables of ground and cluster scores."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import numpy as np
 from rich.console import Console
 
-from lidar_perception.scoring.pictures import save_picture
-from lidar_perception.scoring.points.segmentation import HIT_IOU, MIN_POINTS, PROTOCOLS, select_true_ground
+from lidar_perception.scoring.points.segmentation import HIT_IOU, MIN_POINTS, PROTOCOLS
 from lidar_perception.scoring.tables import format_counts, format_percent, make_table, print_skipped
-from lidar_perception.types import PointCloud
 
 # Precision, recall and F1 of Patchwork++ in percent, mean over sequences 00 to 10 of SemanticKITTI. The first
 # row is from the paper (IROS 2022, Table I), the second from its repository.
 PUBLISHED = {"without vegetation": (94.92, 98.18, 96.51), "with vegetation": (93.72, 92.33, 92.87)}
-
-MAX_DRAWN_RANGE = 50.0  # half width of the picture in metres
 
 
 def print_scores(content: dict, ground_method: str, console: Console) -> None:
@@ -112,48 +105,3 @@ def _format_ms(report: dict) -> str:
 
 def _format_count(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
-def draw_ground(
-    path: Path, name: str, frame: PointCloud, semantic: np.ndarray, ground_by_method: dict[str, np.ndarray]
-) -> None:
-    """Draw a BEV picture of the ground (N,) bool of each method, forward up, and write a PNG file.
-
-    Vegetation is not scored.
-    """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    is_ground, is_counted = select_true_ground(semantic, frame.xyz[:, 2], "without vegetation")
-    figure, rows = plt.subplots(
-        1, len(ground_by_method), figsize=(7 * len(ground_by_method), 7.6), dpi=110, squeeze=False, layout="constrained"
-    )
-    for axes, (method, ground) in zip(rows[0], ground_by_method.items()):
-        for mask, color, label, size in (
-            (~is_counted, "#dddddd", "not scored", 0.2),
-            (is_counted & ~is_ground & ~ground, "#b0b0b0", "true negative", 0.3),
-            (is_counted & is_ground & ground, "#009e73", "true positive", 0.3),
-            (is_counted & is_ground & ~ground, "#0072b2", "false negative", 1.2),
-            (is_counted & ~is_ground & ground, "#d55e00", "false positive", 1.2),
-        ):
-            axes.scatter(
-                -frame.xyz[mask, 1],
-                frame.xyz[mask, 0],
-                s=size,
-                c=color,
-                linewidths=0,
-                label=f"{label} ({int(mask.sum())})",
-            )
-        axes.set(
-            xlim=(-MAX_DRAWN_RANGE, MAX_DRAWN_RANGE),
-            ylim=(-MAX_DRAWN_RANGE, MAX_DRAWN_RANGE),
-            aspect="equal",
-            xlabel="right [m]",
-            ylabel="forward [m]",
-            title=f"{method}, scan {name}",
-        )
-        for handle in axes.legend(loc="upper right", framealpha=0.9).legend_handles:
-            handle.set_sizes([30])
-    save_picture(path, figure)

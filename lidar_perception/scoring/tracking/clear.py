@@ -54,14 +54,13 @@ class ClearCounts:
         }
 
 
-def count_clear(frames: list[Pairs], min_similarity: float = MIN_SIMILARITY) -> ClearCounts:
+def count_clear(frames: list[Pairs]) -> ClearCounts:
     """Count the matches and errors of one sequence.
 
     A label keeps its track of the previous frame if possible.
 
     Args:
         frames: Frames of the sequence in order, as returned by drop_ignored.
-        min_similarity: Minimum similarity of a match.
     """
     true_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.true_ids for f in frames)]))
     last_track, previous_track = (np.full(len(true_ids), -1, np.int64) for _ in range(2))
@@ -75,7 +74,7 @@ def count_clear(frames: list[Pairs], min_similarity: float = MIN_SIMILARITY) -> 
         if len(i) == 0 or len(f.track_ids) == 0:
             continue  # previous_track is kept over such a frame, as in TrackEval
         gain = CONTINUATION_GAIN * (f.track_ids == previous_track[i][:, None]) + f.similarity
-        rows, columns = find_best_pairs(np.where(f.similarity < min_similarity - EPS, 0.0, gain))
+        rows, columns = find_best_pairs(np.where(f.similarity < MIN_SIMILARITY - EPS, 0.0, gain))
         matched_tracks, ids = i[rows], f.track_ids[columns]
         switches += int(((last_track[matched_tracks] >= 0) & (last_track[matched_tracks] != ids)).sum())
         run_counts[matched_tracks] += previous_track[matched_tracks] < 0

@@ -25,8 +25,6 @@ MAX_DONT_CARE_FRACTION = 0.5  # maximum fraction of a box inside a DontCare regi
 MAX_CENTRE_DISTANCE = 2.0  # distance of centres in metres at which the similarity becomes 0
 MIN_SIMILARITY = 0.5  # minimum similarity of a match in CLEAR MOT and of a match with an ignored label
 
-SIMILARITIES = ("centres", "3d", "image")
-
 
 @dataclass(frozen=True)
 class Pairs:
@@ -38,7 +36,8 @@ class Pairs:
         track_ids: (K,) int64, unique ids of the tracks.
         scores: (K,) float64 scores of the tracks.
         is_excused: (K,) bool, True for tracks that are not false positives if they match no label.
-        similarity: (M, K) float64 0..1, for HOTA and CLEAR MOT.
+        similarity: (M, K) float64 0..1, 1 - distance of the centres / MAX_CENTRE_DISTANCE, for HOTA and
+            CLEAR MOT.
         overlap: (M, K) float64 3D IoU, for AB3DMOT's scores.
     """
 
@@ -60,24 +59,17 @@ def to_tracked_labels(ids: np.ndarray, detections: Detections) -> GroundTruth:
     )
 
 
-def make_pairs(
-    truth: GroundTruth, tracks: GroundTruth, calibration: Calibration | None, similarity: str = "centres"
-) -> dict[str, Pairs]:
+def make_pairs(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration | None) -> dict[str, Pairs]:
     """Make the pairs of one frame by class.
 
     Args:
         truth: Labels with a track_id in extras.
         tracks: Tracks as labels with a track_id and score in extras.
         calibration: Camera calibration. With None, box heights and DontCare regions are not used.
-        similarity: "centres": 1 - distance / 2 m, "3d": 3D IoU, "image": IoU of the 2D boxes.
 
     Raises:
         InputError: A track id is missing or duplicate, or a number is not finite.
     """
-    if similarity not in SIMILARITIES:
-        raise InputError(f"similarity = {similarity!r} must be one of {', '.join(SIMILARITIES)}")
-    if similarity == "image" and calibration is None:
-        raise InputError("similarity 'image' requires a camera calibration; use 'centres' or '3d'")
     true_ids, track_ids = read_track_ids(truth, "label"), read_track_ids(tracks, "track")
     camera_labels, camera_tracks = (to_camera_objects(objects, calibration) for objects in (truth, tracks))
     # Labels without a 3D box come last. They are DontCare regions and are also listed in .regions.
@@ -95,7 +87,7 @@ def make_pairs(
         axis=1
     )
     return {
-        name: _make_class_pairs(name, labels_3d, tracks_3d, true_ids, track_ids, is_ignored, is_excused, similarity)
+        name: _make_class_pairs(name, labels_3d, tracks_3d, true_ids, track_ids, is_ignored, is_excused)
         for name in DETECTED
     }
 
@@ -126,26 +118,20 @@ def _make_class_pairs(
     track_ids: np.ndarray,
     is_ignored: np.ndarray,
     is_excused: np.ndarray,
-    similarity: str,
 ) -> Pairs:
     class_id, neighbour_id = CLASSES.index(name), CLASSES.index(NEIGHBOURS.get(name, name))
     rows = np.flatnonzero(np.isin(camera_labels.class_ids, [class_id, neighbour_id]))
     columns = np.flatnonzero(camera_tracks.class_ids == class_id)
     labels, tracks = camera_labels.take(rows), camera_tracks.take(columns)
-    overlap = iou_3d(labels.boxes, tracks.boxes)
-    if similarity == "centres":
-        distance = np.linalg.norm(labels.boxes[:, None, :3] - tracks.boxes[None, :, :3], axis=2)
-        class_similarity = np.maximum(1.0 - distance / MAX_CENTRE_DISTANCE, 0.0)
-    else:
-        class_similarity = overlap if similarity == "3d" else compute_image_iou(labels.image_boxes, tracks.image_boxes)
+    distance = np.linalg.norm(labels.boxes[:, None, :3] - tracks.boxes[None, :, :3], axis=2)
     return Pairs(
         true_ids[rows],
         is_ignored[rows] | (labels.class_ids != class_id),
         track_ids[columns],
         tracks.scores,
         is_excused[columns],
-        class_similarity,
-        overlap,
+        np.maximum(1.0 - distance / MAX_CENTRE_DISTANCE, 0.0),
+        iou_3d(labels.boxes, tracks.boxes),
     )
 
 

@@ -36,12 +36,7 @@ class Observation:
 
 
 def make_observation(
-    sequence: str,
-    index: int,
-    truth: GroundTruth,
-    tracks: GroundTruth,
-    calibration: Calibration | None = None,
-    similarity: str = "centres",
+    sequence: str, index: int, truth: GroundTruth, tracks: GroundTruth, calibration: Calibration | None = None
 ) -> Observation:
     """Make the Observation of a frame. See make_pairs for the other arguments.
 
@@ -49,7 +44,7 @@ def make_observation(
         InputError: The frame cannot be scored. The message contains the sequence and frame.
     """
     try:
-        return Observation(sequence, index, make_pairs(truth, tracks, calibration, similarity))
+        return Observation(sequence, index, make_pairs(truth, tracks, calibration))
     except InputError as error:
         raise InputError(f"{sequence}/{index}: {error}") from None
 
