@@ -21,9 +21,8 @@ from rich.table import Table
 from benchmark.plain_ab3dmot import PlainAb3dmot
 from benchmark.tracking import Step, TrackedFrame, make_peer_step, make_tracker_step
 from lidar_perception.candidates.configurations import BEST
-from lidar_perception.candidates.seed_sources import make_automatic_source
-from lidar_perception.candidates.seeds import load_seeds
 from lidar_perception.classes import DETECTED
+from lidar_perception.detectors.automatic_seed import make_automatic_source
 from lidar_perception.detectors.candidates import CandidateDetector
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.open import open_detector
@@ -56,7 +55,7 @@ def detect(street: int, frames: int, people: float) -> Drive:
     """Run each detector on the first scans of a street. The result includes detections with low scores."""
     params = with_values(BEST, {"seed.source": "automatic"})
     detectors: dict[str, Detector] = {
-        "candidates": CandidateDetector(make_automatic_source(load_seeds(), params), FORWARD_CAMERA.camera(), params),
+        "candidates": CandidateDetector(make_automatic_source(params.seed), FORWARD_CAMERA.camera(), params),
         **{name: open_detector(name, "cpu") for name in NETWORKS},
     }
     detectors = {name: detector.with_min_score(MIN_DETECTION_SCORE) for name, detector in detectors.items()}

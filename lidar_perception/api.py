@@ -13,13 +13,13 @@ from numpy.typing import ArrayLike
 
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.pipeline import find_candidates as run_pipeline
-from lidar_perception.candidates.seed_sources import make_automatic_source, make_click_source
-from lidar_perception.candidates.seeds import load_seeds
+from lidar_perception.candidates.seed_sources import make_click_source
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.params import CLUSTERING_METHODS, ClusteringParams
 from lidar_perception.data.frame import BOXES, Recording
 from lidar_perception.data.mount_check import apply_measured_height, load_first_clouds
 from lidar_perception.data.open import open_recording
+from lidar_perception.detectors.automatic_seed import make_automatic_source
 from lidar_perception.detectors.contract import FUSED, Detector
 from lidar_perception.detectors.custom import as_detector
 from lidar_perception.detectors.open import open_detector
@@ -156,12 +156,12 @@ def find_candidates(
     cluster_ids: np.ndarray | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Detections:
-    """Find pedestrian candidates without a trained network (STM-CPA, configuration `best`).
+    """Find pedestrian candidates by silhouettes (STM-CPA, configuration `best`).
 
     Args:
         xyz: (N, 3) [x y z] or (N, 4) [x y z intensity], metres, z up; or a PointCloud.
         click: (3,) a point on a pedestrian, whose silhouette becomes the template. Default: the
-            cluster that is most likely a pedestrian, or without one the template of the package.
+            clusters that PointNet classifies as pedestrians.
         sensor_height: height of the sensor above the ground, in metres.
         ground: (N,) bool, for example from segment_ground(). Default: computed here.
         cluster_ids: (N,) int, for example from cluster(). Default: computed here.
@@ -177,7 +177,7 @@ def find_candidates(
     """
     params = _set_params(BEST, {"view.enabled": False, "ground.sensor_pose.height": sensor_height, **(settings or {})})
     seed = (
-        make_automatic_source(load_seeds(params.seed.file), params)
+        make_automatic_source(params.seed)
         if click is None
         else make_click_source(np.asarray(click, float), params.seed)
     )

@@ -170,7 +170,7 @@ class Proposer:
     def cut_seed(self, box: Array, frame: int) -> Seed | None:
         """Make a seed from the points in a box (7,) of a frame, or return None if there are too few."""
         try:
-            return seed_from_points(self._select_points(frame, box), box, is_confirmed=True)
+            return seed_from_points(self._select_points(frame, box), box, confidence=1.0)
         except InputError:
             return None
 

@@ -11,10 +11,10 @@ from typing import Any
 from experiments.comparison.outcomes import Contender
 from lidar_perception.candidates.configurations import BEST, PAPER
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.seed_sources import SeedSource, make_automatic_source, make_truth_source
-from lidar_perception.candidates.seeds import load_seeds
+from lidar_perception.candidates.seed_sources import SeedSource, make_truth_source
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame
+from lidar_perception.detectors.automatic_seed import make_automatic_source
 from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.candidates import CandidateDetector
 from lidar_perception.detectors.checkpoint import NETWORKS, POINTNET
@@ -161,7 +161,7 @@ def _make_name(detector: NetworkDetector | CustomDetector, used_names: Sequence[
 
 def _make_candidate_contenders(paper: PipelineParams, best: PipelineParams) -> list[Contender]:
     """Return STM-CPA with the paper's seed, and `best` with the automatic seed."""
-    automatic_source = make_automatic_source(load_seeds(), best)
+    automatic_source = make_automatic_source(best.seed)
     return [
         _make_seeded_contender("STM-CPA paper", paper, _find_labelled_seed),
         _make_seeded_contender("STM-CPA best", best, _find_labelled_seed),

@@ -16,10 +16,10 @@ from experiments.stm_cpa.frames import LabelledFrame, find_nearest, load_labelle
 from lidar_perception.candidates.configurations import BEST, PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import refine_segmented
-from lidar_perception.candidates.seed_sources import make_automatic_source
 from lidar_perception.candidates.seeds import Seed, load_seeds
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud
 from lidar_perception.data.frame import Frame
+from lidar_perception.detectors.automatic_seed import make_automatic_source
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.scoring.centres.matching import RANGE_NAMES, count_by_range, match_centres
 from lidar_perception.types import InputError
@@ -120,7 +120,7 @@ def _find_candidates(segmented: SegmentedCloud, labelled: LabelledFrame, params:
             return (make_nearest_seed(segmented, labelled),)
         templates = load_seeds(params.seed.file)
         if params.seed.source == "automatic":
-            return make_automatic_source(templates, params)(segmented)
+            return make_automatic_source(params.seed)(segmented)
         return templates
 
     stage = params.confidence if params.confidence.enabled else params.stm

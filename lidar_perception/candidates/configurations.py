@@ -35,7 +35,6 @@ BEST_VALUES = {
     "cpa.steps": 0,  # copies are not needed for points drawn with `spread`
     "confidence.enabled": True,
     "confidence.threshold": 0.25,
-    "seed.min_confidence": 0.9,  # if no cluster reaches this, the template is the better seed
 }
 PAPER = with_values(PipelineParams(), PAPER_VALUES)
 BEST = with_values(PAPER, BEST_VALUES)

@@ -107,8 +107,8 @@ class SeedParams(Params):
         "file",
         "ground_truth: the nearest labelled Pedestrian of the frame (the "
         "paper's protocol). click: the cluster at /clicked_point. file: a saved "
-        "template. automatic: the cluster of the frame that most resembles a "
-        "pedestrian, or the template if there is none.",
+        "template. automatic: up to 8 clusters of the frame that PointNet "
+        "classifies as pedestrians; without one there are no candidates.",
         choices=SEED_SOURCES,
     )
     file: str = param("", "Template file for source 'file', or several separated by commas; empty: the shipped one.")
@@ -119,7 +119,9 @@ class SeedParams(Params):
         low=1,
         high=16,
     )
-    min_confidence: float = param(0.3, "For source 'automatic': minimum confidence of the seed.", low=0.0, high=1.0)
+    min_confidence: float = param(
+        0.5, "For source 'automatic': minimum probability, by PointNet, that a seed is a pedestrian.", low=0.0, high=1.0
+    )
     click_radius: float = param(
         2.0, "A click selects the nearest cluster within this distance.", unit="m", low=0.01, high=100.0
     )

@@ -63,7 +63,14 @@ def segment_cloud(
     t4 = perf_counter()
     ms = dict(view=t1 - t0, ground=t2 - t1, clustering=t3 - t2, boxes=t4 - t3)
     return SegmentedCloud(
-        indices, view_cloud.xyz, ground, cluster_ids, boxes, original_ids, ms={k: v * 1e3 for k, v in ms.items()}
+        indices,
+        view_cloud.xyz,
+        ground,
+        cluster_ids,
+        boxes,
+        original_ids,
+        view_cloud.intensity,
+        {k: v * 1e3 for k, v in ms.items()},
     )
 
 

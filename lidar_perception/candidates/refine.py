@@ -62,11 +62,13 @@ def refine_clusters(
         xyz: (N, 3) points.
         labels: (N,) cluster of each point, 0 for none.
         boxes: (K, 7) boxes of the clusters, snapped to the ground.
-        seeds: Seed pedestrians.
+        seeds: Seed pedestrians. Without one there are no candidates.
         params: Parameters of the pipeline.
     """
     t0 = perf_counter()
-    has_seed_height = np.array([select_by_height(boxes, seed.height, params.height) for seed in seeds])
+    has_seed_height = np.zeros((len(seeds), len(boxes)), bool)
+    for mask, seed in zip(has_seed_height, seeds):
+        mask[:] = select_by_height(boxes, seed.height, params.height)
     indices = np.flatnonzero(has_seed_height.any(axis=0))
     has_seed_height = has_seed_height[:, indices]
     boxes = boxes[indices]
@@ -75,7 +77,9 @@ def refine_clusters(
     templates = [seed.draw_silhouette(params) for seed in seeds]
     points, start = group_points(xyz, labels, indices + 1)
     images = draw_silhouettes(points, start, np.ones((len(indices), 1)), floors, params)
-    stm_scores = np.array([compute_similarity(images, template, params.stm) for template in templates])
+    stm_scores = np.zeros(has_seed_height.shape)
+    for scores, template in zip(stm_scores, templates):
+        scores[:] = compute_similarity(images, template, params.stm)
     t2 = perf_counter()
     ranges = np.hypot(boxes[:, 0], boxes[:, 1])
     scales = compute_cpa_scales(ranges, params.cpa)
@@ -98,12 +102,12 @@ def refine_clusters(
         for seed, *similarities in zip(seeds, stm_scores, cpa_scores):
             # The seed's own cluster always has a similarity of 1, which carries no information.
             is_seed = find_seed_cluster(seed, points, start)
-            seed_confidence = 1.0 if seed.is_confirmed else compute_confidence(shape)
+            seed_confidence = compute_confidence(shape) if seed.confidence is None else seed.confidence
             height_difference = shape["height_m"] - seed.height
             for scores in similarities:
                 scores[:] = np.where(is_seed, seed_confidence, compute_confidence(shape, scores, height_difference))
     stm_scores, cpa_scores = (
-        np.where(has_seed_height, scores, -np.inf).max(axis=0) for scores in (stm_scores, cpa_scores)
+        np.where(has_seed_height, scores, -np.inf).max(axis=0, initial=-np.inf) for scores in (stm_scores, cpa_scores)
     )
     t4 = perf_counter()
 

@@ -28,13 +28,14 @@ class Seed:
         xyz: (M, 3) float32 points in the LiDAR frame, M >= 10.
         floor: z of the ground below the pedestrian, metres.
         height: Body height, metres.
-        is_confirmed: True if a user or a label confirms that it is a pedestrian.
+        confidence: Probability that it is a pedestrian, 1 if a user or a label confirms it. None if it is
+            unknown or, as for a template, irrelevant.
     """
 
     xyz: np.ndarray
     floor: float
     height: float
-    is_confirmed: bool = False
+    confidence: float | None = None
 
     def draw_silhouette(self, params: PipelineParams = PipelineParams()) -> np.ndarray:
         """Draw the silhouette of the seed, (80,) uint32, see silhouette.py."""
@@ -43,7 +44,7 @@ class Seed:
         )[0]
 
 
-def seed_from_points(xyz: np.ndarray, box: np.ndarray, is_confirmed: bool = False) -> Seed:
+def seed_from_points(xyz: np.ndarray, box: np.ndarray, confidence: float | None = None) -> Seed:
     """Make a seed from a pedestrian's points (M, 3) and its box (7,) on the ground.
 
     Raises:
@@ -53,7 +54,7 @@ def seed_from_points(xyz: np.ndarray, box: np.ndarray, is_confirmed: bool = Fals
         raise InputError(
             f"the seed pedestrian has only {len(xyz)} points, but needs at least {MIN_POINTS}; choose a nearer one"
         )
-    return Seed(np.ascontiguousarray(xyz, np.float32), float(box[2] - box[5] / 2), float(box[5]), is_confirmed)
+    return Seed(np.ascontiguousarray(xyz, np.float32), float(box[2] - box[5] / 2), float(box[5]), confidence)
 
 
 def find_seed_cluster(seed: Seed, xyz: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -87,7 +88,7 @@ def seed_from_truth(xyz: np.ndarray, ground: np.ndarray, pedestrians: np.ndarray
     if len(pedestrians) == 0:
         raise InputError("no seed, because the ground truth of this frame has no Pedestrian")
     nearest = pedestrians[np.argmin(np.hypot(pedestrians[:, 0], pedestrians[:, 1]))]
-    return seed_from_points(xyz[points_in_box(xyz, nearest) & ~ground], nearest, is_confirmed=True)
+    return seed_from_points(xyz[points_in_box(xyz, nearest) & ~ground], nearest, confidence=1.0)
 
 
 def seed_from_click(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray, radius: float) -> Seed:
@@ -104,7 +105,7 @@ def seed_from_click(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, boxe
         InputError: See find_clicked_cluster, or the cluster has too few points.
     """
     label = find_clicked_cluster(click, xyz, labels, radius)
-    return seed_from_points(xyz[labels == label], boxes[label - 1], is_confirmed=True)
+    return seed_from_points(xyz[labels == label], boxes[label - 1], confidence=1.0)
 
 
 def find_clicked_cluster(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, radius: float) -> int:

@@ -14,6 +14,9 @@ from lidar_perception.ground.threshold import fit_plane, fit_plane_by_ransac
 from lidar_perception.types import EMPTY_CLOUD, InputError, PointCloud
 from lidar_perception.wire.params import ViewParams
 
+# Size limits of clusters that may be a pedestrian or a cyclist.
+MIN_HEIGHT_M, MAX_HEIGHT_M, MAX_LENGTH_M = 0.8, 2.6, 2.8
+
 
 @dataclass(frozen=True)
 class SegmentedCloud:
@@ -26,6 +29,7 @@ class SegmentedCloud:
         cluster_ids: (M,) int32 cluster 1..K of each point, 0 for none.
         boxes: (K, 7) float32 boxes of the clusters, extended down to the ground plane.
         original_ids: (K,) int64 ids of the clusters in the input; None if they are 1..K.
+        intensity: (M,) float32 intensities 0..1 of the points, or None.
         ms: Duration of each step in milliseconds.
     """
 
@@ -35,6 +39,7 @@ class SegmentedCloud:
     cluster_ids: np.ndarray
     boxes: np.ndarray
     original_ids: np.ndarray | None = None
+    intensity: np.ndarray | None = None
     ms: dict[str, float] = field(default_factory=dict)
 
 
@@ -44,6 +49,15 @@ def fit_grounded_boxes(
     """Fit boxes (K, 7) to clusters 1..K and extend them down to the ground plane."""
     plane = fit_ground_plane(xyz.compress(ground, axis=0), params)
     return snap_to_ground(fit_boxes(xyz, cluster_ids, params.shape), plane)
+
+
+def is_person_sized(boxes: np.ndarray) -> np.ndarray:
+    """Return a mask (K,) bool of the boxes (K, 7) that are not too large or too small for a person."""
+    return (
+        (boxes[:, 5] >= MIN_HEIGHT_M)
+        & (boxes[:, 5] <= MAX_HEIGHT_M)
+        & (boxes[:, 3:5].max(axis=1, initial=0.0) <= MAX_LENGTH_M)
+    )
 
 
 def snap_to_ground(boxes: np.ndarray, plane: np.ndarray | None) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
-from lidar_perception.candidates.seed_sources import make_automatic_source
+from lidar_perception.candidates.seed_sources import make_fixed_source
 from lidar_perception.candidates.seeds import seed_from_points
 from lidar_perception.candidates.segmented_cloud import crop_to_view, fit_grounded_boxes
 from lidar_perception.clustering.cluster import cluster_obstacles
@@ -74,11 +74,10 @@ def warm_up_candidates(params: PipelineParams, segmented: bool = False) -> None:
     """Compile the pipeline, or only the stages after the clustering if `segmented` is True."""
     person = _make_person()
     seed = seed_from_points(person, np.array([8, 0, -0.85, 1, 1, 1.7, 0]))
-    params = with_values(params, {"seed.min_confidence": 0.0})
     cloud = _make_cloud()
     ids = np.arange(len(cloud)) // 200
     columns = dict(ground=ids < 3, cluster_ids=np.maximum(ids - 2, 0)) if segmented else {}
-    find_candidates(cloud, make_automatic_source([seed], params), CAMERA, params, **columns)
+    find_candidates(cloud, make_fixed_source(seed), CAMERA, params, **columns)
     if not segmented:
         _warm_up_tree(params.clustering)
 

@@ -50,6 +50,12 @@ class CandidateRefinement(ManagedNode):
             ids, numbers = clusters
             ground = np.zeros(len(ids), bool) if ground is None else ground > 0
             segmented = SegmentedCloud(
-                indices, frame.xyz, ground, ids, fit_grounded_boxes(frame.xyz, ground, ids, self.params.boxes), numbers
+                indices,
+                frame.xyz,
+                ground,
+                ids,
+                fit_grounded_boxes(frame.xyz, ground, ids, self.params.boxes),
+                numbers,
+                frame.intensity,
             )
             self.results.publish(msg.header, frame.xyz, lambda: refine_segmented(segmented, source, self.params))

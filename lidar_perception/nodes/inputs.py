@@ -12,19 +12,16 @@ import numpy as np
 
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.params import SeedParams
-from lidar_perception.candidates.seed_sources import (
-    SeedSource,
-    make_automatic_source,
-    make_click_source,
-    make_truth_source,
-)
+from lidar_perception.candidates.seed_sources import SeedSource, make_click_source, make_truth_source
 from lidar_perception.candidates.seeds import Seed, load_seeds
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud
+from lidar_perception.detectors.automatic_seed import make_automatic_source, warm_up_automatic_seed
 from lidar_perception.nodes.graph import make_relative
 from lidar_perception.nodes.interfaces import LATCHED, MARKERS, RELIABLE, SENSOR_DATA
 from lidar_perception.nodes.runtime import LidarNode
 from lidar_perception.robot.poses import invert_pose, transform_boxes, transform_points
 from lidar_perception.robot.transform_tree import JUMP_NS, MissingTransform
+from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.types import PEDESTRIAN, InputError
 from lidar_perception.wire.messages import make_calibration, read_calibration, to_truth
 from lidar_perception.wire.params import ViewParams
@@ -161,8 +158,11 @@ class SeedInput:
             make_relative(CLICK), "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE, private=False
         )
         node.inputs.items.append(self)
-        if self.params.source in ("file", "automatic"):
+        if self.params.source == "file":
             self._load_templates()  # a missing file is reported before the first cloud
+        elif self.params.source == "automatic":
+            with lock_compilation(node.get_logger().info):
+                warm_up_automatic_seed()
 
     def open(self) -> None:
         """Do nothing: the subscriptions of the node are opened by the node."""
@@ -180,19 +180,15 @@ class SeedInput:
             self.matcher.add_cloud(to_ns(msg.header.stamp), msg)
         elif self.params.source == "click":
             self.deliver(msg, partial(self._make_clicked_seeds, msg.header))
+        elif self.params.source == "automatic":
+            self.deliver(msg, make_automatic_source(self.params))
         else:
-            self.deliver(msg, self._make_file_seeds)
+            self.deliver(msg, lambda _: self._load_templates())
 
     def _load_templates(self) -> tuple[Seed, ...]:
         if self.loaded_templates is None or self.loaded_templates[0] != self.params.file:
             self.loaded_templates = (self.params.file, load_seeds(self.params.file))
         return self.loaded_templates[1]
-
-    def _make_file_seeds(self, segmented: SegmentedCloud) -> tuple[Seed, ...]:
-        templates = self._load_templates()
-        return (
-            templates if self.params.source == "file" else make_automatic_source(templates, self.node.params)(segmented)
-        )
 
     def _on_truth(self, msg: Any) -> None:
         objects = from_marker_array(msg)

@@ -22,8 +22,8 @@ from lidar_perception.candidates.configurations import BEST, PAPER
 from lidar_perception.candidates.params import PipelineParams, StmParams
 from lidar_perception.candidates.pipeline import refine_segmented, segment_cloud
 from lidar_perception.candidates.refine import refine_clusters
-from lidar_perception.candidates.seed_sources import make_automatic_source, make_fixed_source, make_truth_source
-from lidar_perception.candidates.seeds import find_seed_cluster, load_seed, seed_from_points
+from lidar_perception.candidates.seed_sources import make_fixed_source, make_truth_source
+from lidar_perception.candidates.seeds import find_seed_cluster, seed_from_points
 from lidar_perception.candidates.silhouette import (
     COLUMNS,
     ROWS,
@@ -236,16 +236,16 @@ def test_seed_cluster_contains_points_of_the_seed():
     assert find_seed_cluster(seed, np.zeros((0, 3), np.float32), np.array([0])).shape == (0,)
 
 
-@pytest.mark.parametrize("is_confirmed", [True, False])
-def test_confirmed_seed_has_confidence_1(is_confirmed):
+@pytest.mark.parametrize("confidence", [1.0, 0.7, None])
+def test_cluster_of_the_seed_has_the_confidence_of_the_seed(confidence):
     xyz, start, boxes = make_two_people()
     boxes[1, 1] += 3.0
     ids = np.repeat(np.int32([1, 2]), np.diff(start))
     params = with_values(BEST, {"confidence.threshold": 0.0})
-    seed = seed_from_points(xyz[: start[1]], boxes[0], is_confirmed)
+    seed = seed_from_points(xyz[: start[1]], boxes[0], confidence)
     scores = refine_clusters(xyz, ids, boxes, [seed], params).final.scores
     shape = compute_confidence(compute_shape_features(xyz, start, boxes, BEST))
-    assert scores[0] == pytest.approx(1.0 if is_confirmed else shape[0], abs=1e-6)
+    assert scores[0] == pytest.approx(shape[0] if confidence is None else confidence, abs=1e-6)
     assert scores[1] == pytest.approx(
         refine_clusters(
             xyz, ids, boxes, [seed_from_points(xyz[: start[1]] + np.float32([0, 0.5, 0]), boxes[0])], params
@@ -273,27 +273,6 @@ def test_best_configuration_accepts_clusters_by_confidence():
     some = refine_segmented(s, make_fixed_source(seed), with_values(params, {"confidence.threshold": limit})).final
     assert 0 < len(some) < len(all_)
     assert sorted(some.scores) == sorted(all_.scores[all_.scores >= np.float32(limit)])
-
-
-def test_automatic_seed_is_the_best_cluster_or_the_template():
-    template = load_seed()
-    params = with_values(BEST, {"view.enabled": False})
-    empty = segment_cloud(PointCloud(np.zeros((0, 3), np.float32)), params=params)
-    assert make_automatic_source([template], params)(empty) == (template,)
-    one = segment_cloud(
-        PointCloud(
-            np.concatenate(
-                [
-                    make_board(9.0, 0.55),
-                    np.float32([[x, y, FLOOR] for x in np.arange(3, 20, 0.4) for y in np.arange(-8, 8, 0.4)]),
-                ]
-            )
-        ),
-        params=params,
-    )
-    assert make_automatic_source([template], with_values(params, {"seed.min_confidence": 1.0}))(one) == (template,)
-    (own,) = make_automatic_source([template], with_values(params, {"seed.min_confidence": 0.0}))(one)
-    assert own is not template and np.hypot(*own.xyz[:, :2].mean(axis=0)) == pytest.approx(9, abs=1)
 
 
 @needs_data

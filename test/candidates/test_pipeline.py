@@ -9,15 +9,9 @@ from candidate_samples import boxes_at, floor, person, scene
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.params import STEPS, PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates, segment_cloud
-from lidar_perception.candidates.seed_sources import (
-    make_automatic_source,
-    make_click_source,
-    make_fixed_source,
-    make_truth_source,
-)
+from lidar_perception.candidates.seed_sources import make_click_source, make_fixed_source, make_truth_source
 from lidar_perception.candidates.seeds import seed_from_points
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud
-from lidar_perception.param_fields import with_values
 from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.params import ViewParams
 
@@ -97,15 +91,3 @@ def test_ground_points_have_no_cluster_and_ids_match_boxes():
     segmented = segment_cloud(PointCloud(scene()))
     assert not (segmented.ground & (segmented.cluster_ids > 0)).any()
     assert np.unique(segmented.cluster_ids).tolist() == list(range(len(segmented.boxes) + 1))
-
-
-@pytest.mark.parametrize(
-    "xyz", [np.zeros((0, 3)), floor(), person(6, 0, count=9)], ids=["empty", "only ground", "nine points"]
-)
-@pytest.mark.parametrize("min_confidence", [0.0, 0.5])
-def test_automatic_seed_falls_back_to_the_template(xyz, min_confidence):
-    params = with_values(PipelineParams(), {"seed.min_confidence": min_confidence, "clustering.dbscan.min_samples": 3})
-    template_seed = seed_from_points(person(7, 2).astype(np.float32), boxes_at([[7, 2]])[0])
-    assert make_automatic_source([template_seed], params)(
-        segment_cloud(PointCloud(xyz.astype(np.float32)), params=params)
-    ) == (template_seed,)

@@ -17,7 +17,7 @@ from scipy.special import expit, logit
 
 from lidar_perception.candidates.confidence import compute_confidence, compute_log_odds, compute_shape_features
 from lidar_perception.candidates.configurations import BEST
-from lidar_perception.candidates.segmented_cloud import snap_to_ground
+from lidar_perception.candidates.segmented_cloud import is_person_sized, snap_to_ground
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.detectors.fused.fusion import Models
 from lidar_perception.geometry import centre_distances
@@ -25,8 +25,6 @@ from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.groups import group_points
 from lidar_perception.types import CLASSES
 
-# Size limits of clusters that may be a pedestrian or a cyclist.
-MIN_HEIGHT_M, MAX_HEIGHT_M, MAX_LENGTH_M = 0.8, 2.6, 2.8
 MAX_DISTANCE_M = 0.6  # maximum distance between the centres of a proposal and its cluster
 MIN_PROBABILITY, MAX_PROBABILITY = 0.001, 0.999  # each source's probability is clipped to this interval
 
@@ -59,11 +57,7 @@ def find_silhouette_confidence(
     Returns:
         (K,) float64, 0..1; 0 for boxes without a cluster of a suitable size.
     """
-    indices = np.flatnonzero(
-        (clusters[:, 5] >= MIN_HEIGHT_M)
-        & (clusters[:, 5] <= MAX_HEIGHT_M)
-        & (clusters[:, 3:5].max(axis=1, initial=0.0) <= MAX_LENGTH_M)
-    )
+    indices = np.flatnonzero(is_person_sized(clusters))
     is_near = centre_distances(boxes, clusters[indices]) <= MAX_DISTANCE_M
     has_box = is_near.any(axis=0)
     indices, is_near = indices[has_box], is_near[:, has_box]

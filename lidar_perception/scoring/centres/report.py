@@ -12,15 +12,11 @@ import numpy as np
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.refine import STAGES, Candidates
-from lidar_perception.candidates.seed_sources import (
-    SeedSource,
-    make_automatic_source,
-    make_fixed_source,
-    make_truth_source,
-)
+from lidar_perception.candidates.seed_sources import SeedSource, make_fixed_source, make_truth_source
 from lidar_perception.candidates.seeds import Seed, load_seeds
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame, Recording
+from lidar_perception.detectors.automatic_seed import make_automatic_source
 from lidar_perception.scoring.centres.matching import RANGE_NAMES, Score, find_range_bins
 from lidar_perception.scoring.kitti.camera_objects import select_in_image
 from lidar_perception.types import PEDESTRIAN, GroundTruth, InputError
@@ -104,7 +100,7 @@ def make_seed_source(truth: np.ndarray, templates: Sequence[Seed] | None, params
     if templates is None:
         return make_truth_source(truth)
     if params.seed.source == "automatic":
-        return make_automatic_source(templates, params)
+        return make_automatic_source(params.seed)
     return make_fixed_source(*templates)
 
 
