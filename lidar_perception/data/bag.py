@@ -21,7 +21,6 @@ from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Qos
 
 from lidar_perception.data.bag_metadata import (
-    LATCHED_QOS,
     METADATA_FILE,
     SENSOR_QOS,
     add_differences,
@@ -39,8 +38,6 @@ from lidar_perception.runs.resuming import lock_folder
 from lidar_perception.types import InputError, InputWarning
 from lidar_perception.wire.codec import decode, encode, load_typestore
 from lidar_perception.wire.compression import decompress_message
-
-__all__ = ["LATCHED_QOS", "SENSOR_QOS", "Bag", "BagHandle", "BagWriter"]
 
 # Chunks of several clouds compress better and are faster to read; a KITTI cloud has 1.9 MB.
 CHUNK_BYTES = 8 * 2**20
@@ -83,7 +80,7 @@ class BagWriter:
         require_name(self.path)
         self.partial = self.path.with_name(self.path.name + ".incomplete")
         self.channels: dict[str, int] = {}
-        self.topics: list[dict] = []
+        self.topics: dict[str, dict] = {}  # entries of metadata.yaml, by name
         self.times: list[int] = []
         self._check_target()
 
@@ -125,30 +122,24 @@ class BagWriter:
         self.channels[topic] = self.mcap.register_channel(
             topic, "cdr", schema, {"offered_qos_profiles": _to_yaml(profile), "topic_type_hash": digest}
         )
-        self.topics.append(
-            {
-                "topic_metadata": {
-                    "name": topic,
-                    "type": type_name,
-                    "serialization_format": "cdr",
-                    "offered_qos_profiles": profile,
-                    "type_description_hash": digest,
-                },
-                "message_count": 0,
-            }
-        )
+        self.topics[topic] = {
+            "topic_metadata": {
+                "name": topic,
+                "type": type_name,
+                "serialization_format": "cdr",
+                "offered_qos_profiles": profile,
+                "type_description_hash": digest,
+            },
+            "message_count": 0,
+        }
 
     def write(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Append a message.
-
-        Args:
-            message: object made by make_bag_message, or CDR bytes.
-        """
+        """Append a message, given as CDR bytes or as an object made by make_bag_message."""
         channel = self.channels[topic]
         raw = message if isinstance(message, bytes) else encode(message)
         with self._convert_write_errors():
             self.mcap.add_message(channel, stamp_ns, raw, stamp_ns)
-        self.topics[list(self.channels).index(topic)]["message_count"] += 1
+        self.topics[topic]["message_count"] += 1
         self.times.append(stamp_ns)
 
     def __exit__(self, error_type, error, traceback) -> None:
@@ -169,7 +160,7 @@ class BagWriter:
 
     def _finish(self) -> None:
         start = min(self.times, default=0)
-        count = sum(t["message_count"] for t in self.topics)
+        count = sum(entry["message_count"] for entry in self.topics.values())
         span = {
             "starting_time": {"nanoseconds_since_epoch": start},
             "duration": {"nanoseconds": max(self.times, default=0) - start},
@@ -181,7 +172,7 @@ class BagWriter:
             "storage_identifier": "mcap",
             "relative_file_paths": [name],
             **span,
-            "topics_with_message_count": self.topics,
+            "topics_with_message_count": [*self.topics.values()],
             "compression_format": "",
             "compression_mode": "",
             "files": [{"path": name, **span}],
@@ -227,22 +218,21 @@ class Bag:
             self.topics: dict[str, str] = {}
             self.counts: dict[str, int] = {}
             self.unreadable: dict[str, Topic] = {}
-            recorded, problems = self._collect_topics()
+            message_counts, problems = self._collect_topics()
             times = [file.times for _, file in self.files if file.times is not None]
             self.start_ns = min((first for first, _ in times), default=0)
             self.end_ns = max((last + 1 for _, last in times), default=0)
-            add_differences(metadata, recorded, self.start_ns, self.end_ns - self.start_ns - 1)
-            self._offered = metadata.qos
+            add_differences(metadata, message_counts, self.start_ns, self.end_ns - self.start_ns - 1)
+            self._edited_qos = metadata.qos
             for topic, (type_name, _) in metadata.topics.items():
                 if topic not in self.unreadable:
                     self.topics.setdefault(topic, type_name)
                     self.counts.setdefault(topic, 0)
             if metadata.problems:
-                shown, more = metadata.problems[:MAX_SHOWN], len(metadata.problems) - MAX_SHOWN
+                more = len(metadata.problems) - MAX_SHOWN
                 problems.append(
-                    f"{self.path / METADATA_FILE} does not match the bag: {'; '.join(shown)}"
-                    f"{f', and {more} more' if more > 0 else ''}. The contents of the "
-                    "storage files are used"
+                    f"{self.path / METADATA_FILE} does not match the bag: {'; '.join(metadata.problems[:MAX_SHOWN])}"
+                    f"{f', and {more} more' if more > 0 else ''}. The contents of the storage files are used"
                 )
             for problem in problems if warn else ():
                 warnings.warn(problem, InputWarning, stacklevel=2)
@@ -255,11 +245,11 @@ class Bag:
             The number of messages of every topic, readable or not, and a warning for each topic
             with several types. Only the most frequent type of such a topic is read.
         """
-        recorded, problems = Counter[str](), []
+        message_counts, problems = Counter[str](), []
         counts_by_topic: dict[str, Counter[str]] = {}
         for _, file in self.files:
             for topic in file.topics:
-                recorded[topic.name] += topic.messages
+                message_counts[topic.name] += topic.messages
                 if topic.encoding == "cdr":
                     counts_by_topic.setdefault(topic.name, Counter())[topic.type] += topic.messages
                 else:
@@ -267,12 +257,12 @@ class Bag:
         for name, counts_by_type in counts_by_topic.items():
             self.unreadable.pop(name, None)
             (self.topics[name], self.counts[name]), *others = counts_by_type.most_common()
-            if ignored := [f"{count} of {type_name}" for type_name, count in others if count]:
+            if ignored_types := [f"{count} of {type_name}" for type_name, count in others if count]:
                 problems.append(
                     f"{self.path}: {name} has messages of several types; only "
-                    f"{self.topics[name]} is read, not {', '.join(ignored)}"
+                    f"{self.topics[name]} is read, not {', '.join(ignored_types)}"
                 )
-        return recorded, problems
+        return message_counts, problems
 
     def __enter__(self) -> Bag:
         return self
@@ -302,7 +292,7 @@ class Bag:
 
         Profiles in metadata.yaml take precedence, because people edit it for `ros2 bag play`.
         """
-        return parse_profiles(self._offered.get(topic)) or list(
+        return parse_profiles(self._edited_qos.get(topic)) or list(
             dict.fromkeys(
                 profile
                 for _, file in self.files
@@ -353,15 +343,15 @@ class Bag:
         }
         if not name_by_id:
             return
-        message_counts = Counter[int]()
+        read_counts = Counter[int]()
         try:
             for topic_id, time, data in file.messages(name_by_id, start, stop):
-                message_counts[topic_id] += 1
+                read_counts[topic_id] += 1
                 yield name_by_id[topic_id], time, decompress_message(data)
             for topic in file.topics if start <= self.start_ns and stop == END else ():
-                if topic.id in name_by_id and topic.messages != message_counts[topic.id]:
+                if topic.id in name_by_id and topic.messages != read_counts[topic.id]:
                     raise ValueError(
-                        f"it declares {topic.messages} messages on {topic.name} and has {message_counts[topic.id]}"
+                        f"it declares {topic.messages} messages on {topic.name} and has {read_counts[topic.id]}"
                     )
         except Exception as error:  # zstd, struct, SQLite and rosbags raise their own types
             raise InputError(describe_damage(path, error)) from None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
-from itertools import takewhile
+from itertools import pairwise, takewhile
 from typing import Any
 
 import numpy as np
@@ -30,8 +30,10 @@ def choose_odometry_topic(topics: Mapping[str, str]) -> str:
         topics: {topic: type}.
     """
     odometry_topics = [name for name, type_name in topics.items() if type_name == ODOMETRY_MESSAGE]
-    preferred = [name for name in (ODOMETRY, FILTERED_ODOMETRY) if name in odometry_topics]
-    return preferred[0] if preferred else odometry_topics[0] if len(odometry_topics) == 1 else ""
+    for name in (ODOMETRY, FILTERED_ODOMETRY):
+        if name in odometry_topics:
+            return name
+    return odometry_topics[0] if len(odometry_topics) == 1 else ""
 
 
 class BagPoses:
@@ -64,11 +66,10 @@ class BagPoses:
         Raises MissingTransform if a pose is unknown.
         """
         if self.odometry_topic:
-            if self.frame_id == self._first_odometry.header.frame_id.lstrip(
-                "/"
-            ):  # the clouds are already in a fixed frame
+            # The clouds may already be in the fixed frame.
+            if self.frame_id == self._first_odometry.header.frame_id.lstrip("/"):
                 return np.tile(np.eye(4), (len(times), 1, 1))
-            return self.lookup_odometry(times) @ self._sensor_in_odometry_child(times)
+            return self.lookup_odometry(times) @ self._find_sensor_in_child_frame(times)
         if not self.fixed_frame:
             raise MissingTransform(
                 f"{self.path} has neither odometry nor a TF in which '{self.frame_id}' moves; record one of them"
@@ -98,21 +99,22 @@ class BagPoses:
     @cached_property
     def fixed_frame(self) -> str:
         """TF frame in which the sensor moves; "" if no ancestor of the sensor moves."""
-        moving = [
-            self._ancestors[i + 1]
-            for i, frame in enumerate(self._ancestors[:-1])
-            if not self._first_transforms.is_fixed(frame)
+        fixed_frames = [
+            parent for frame, parent in pairwise(self._ancestors) if not self._first_transforms.is_fixed(frame)
         ]
-        return ODOMETRY_FRAME if ODOMETRY_FRAME in moving else moving[-1] if moving else ""
+        return ODOMETRY_FRAME if ODOMETRY_FRAME in fixed_frames else fixed_frames[-1] if fixed_frames else ""
 
     def find_mount(self, base: str) -> np.ndarray | None:
         """Return the pose (4, 4) of the sensor in a frame of the robot; None if it is not constant."""
         base_chain = self._list_parents(base)
-        common = next((frame for frame in self._ancestors if frame in base_chain), None)
-        if common is None or not all(
+        common_ancestor = next((frame for frame in self._ancestors if frame in base_chain), None)
+        if common_ancestor is None or not all(
             map(
                 self._first_transforms.is_fixed,
-                (*self._ancestors[: self._ancestors.index(common)], *base_chain[: base_chain.index(common)]),
+                (
+                    *self._ancestors[: self._ancestors.index(common_ancestor)],
+                    *base_chain[: base_chain.index(common_ancestor)],
+                ),
             )
         ):
             return None
@@ -164,12 +166,9 @@ class BagPoses:
         """
         return self._odometry.lookup_many(FIXED, MOVING, times, MAX_POSE_GAP_S)
 
-    def _sensor_in_odometry_child(self, times: np.ndarray) -> np.ndarray:
-        """Return the pose of the sensor in the odometry's child frame.
-
-        Returns:
-            (4, 4) if it is fixed, otherwise (M, 4, 4) at times (M,) ns; identity without TF.
-        """
+    def _find_sensor_in_child_frame(self, times: np.ndarray) -> np.ndarray:
+        """Return the pose of the sensor in the odometry's child frame: (4, 4) if it is fixed, otherwise
+        (M, 4, 4) at times (M,) ns. Without TF, it is the identity."""
         if not {*self._ancestors} & {*self._list_parents(self.odometry_child_frame)}:
             return np.eye(4)
         if (pose := self.find_mount(self.odometry_child_frame)) is not None:

@@ -191,10 +191,10 @@ class Recording:
         Raises InputError if a name is unknown.
         """
         numbers = {frame.name: i for i, frame in enumerate(self.frames)}
-        if unknown := [name for name in names if name not in numbers]:
+        if unknown_names := [name for name in names if name not in numbers]:
             raise InputError(
-                f"{self.path} has no frame {unknown[0]} ({len(unknown)} unknown names); its first frame is "
-                f"{next(iter(numbers), 'none')}"
+                f"{self.path} has no frame {unknown_names[0]} ({len(unknown_names)} unknown names in all); names there "
+                f"look like {next(iter(numbers), 'none')}"
             )
         return replace(self, frames=[self.frames[numbers[name]] for name in names], missing_scans=())
 

@@ -177,13 +177,13 @@ class McapFile:
         return messages[np.argsort(messages["time"], kind="stable")]
 
     def _check_summary(self, summary: bytes) -> None:
-        indexed = []
+        index_entries = []
         for record_type, offset, length in _iterate_records(partial(_slice, summary), 0, len(summary)):
             if record_type in (SCHEMA, CHANNEL):
                 self._add_definition(record_type, summary[offset : offset + length])
             elif record_type == CHUNK_INDEX:
-                indexed.append(_parse_chunk_index(summary[offset : offset + length]))
-        if indexed and sorted(indexed) != sorted(chunk.index_entry for chunk in self.chunks):
+                index_entries.append(_parse_chunk_index(summary[offset : offset + length]))
+        if index_entries and sorted(index_entries) != sorted(chunk.index_entry for chunk in self.chunks):
             raise ValueError("the index does not match the data")
 
     def _add_definition(self, record_type: int, content: bytes) -> None:

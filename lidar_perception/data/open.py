@@ -1,4 +1,4 @@
-"""Opening of recordings in any supported layout, and the stored height of their sensor."""
+"""Opening of recordings in any supported layout, and reading of the sensor height stored with them."""
 
 from __future__ import annotations
 
@@ -157,18 +157,18 @@ def _select_split(recording: Recording, split: Path) -> Recording:
     first = next(iter(frames), "none")
     if not names:
         raise InputError(f"{split} is empty; write the name of a frame or sequence on each line, such as {first}")
-    selected: dict[str, None] = {}
-    unknown: list[str] = []
+    selected_names: dict[str, None] = {}
+    unknown_names: list[str] = []
     for name in names:
         matches: Sequence[str] = [name] if name in frames else sequences.get(name, ())
-        selected.update(dict.fromkeys(matches))
-        unknown += [] if matches else [name]
-    if unknown:
+        selected_names.update(dict.fromkeys(matches))
+        unknown_names += [] if matches else [name]
+    if unknown_names:
         raise InputError(
-            f"{split} lists {unknown[0]} ({len(unknown)} unknown names), which is not in "
-            f"{recording.path}; the first frame there is {first}"
+            f"{split} lists names that are not in {recording.path}, such as {unknown_names[0]} "
+            f"({len(unknown_names)} in all); names there look like {first}"
         )
-    return recording.select(list(selected))
+    return recording.select(list(selected_names))
 
 
 def write_height(folder: Path, height: float) -> None:

@@ -1,9 +1,9 @@
-"""Reader of PCD files (Point Cloud Library, versions .5 to .7): ascii, binary,
-binary_compressed."""
+"""Reader of PCD files of the Point Cloud Library, versions .5 to .7: ascii, binary and binary_compressed."""
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from lidar_perception.runs.files import check_regular
 from lidar_perception.types import InputError
 
 MAX_HEADER_BYTES = 1 << 16
-MAX_CLOUD_BYTES = 2**31  # maximum size of the points declared by a file
+MAX_CLOUD_BYTES = 2**31  # maximum size of the points that a header may declare
 KIND_CODES = {"F": "f", "I": "i", "U": "u"}
 
 
@@ -27,14 +27,21 @@ def read_pcd(path: Path) -> np.ndarray:
     Raises:
         InputError: the file is not a PCD file, or truncated.
     """
+    return read_and_parse(path, _parse_points, "PCD")
+
+
+def read_and_parse(path: Path, parse: Callable[[bytes], np.ndarray], format_name: str) -> np.ndarray:
+    """Return parse(content of the file). Raises InputError if the file cannot be read or parsed."""
     try:
         content = check_regular(path).read_bytes()
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}; download it again") from None
     try:
-        return _parse_points(content.removeprefix(b"\xef\xbb\xbf"))
+        return parse(content.removeprefix(b"\xef\xbb\xbf"))
     except (ValueError, TypeError, OverflowError, LookupError, struct.error) as error:
-        raise InputError(f"{path} is not a readable PCD file ({error}); save it again as binary PCD") from None
+        raise InputError(
+            f"{path} is not a readable {format_name} file ({error}); save it again as binary {format_name}"
+        ) from None
 
 
 def _parse_points(content: bytes) -> np.ndarray:
@@ -76,8 +83,8 @@ def _parse_points(content: bytes) -> np.ndarray:
         points = _parse_compressed_points(data, layout, point_count)
     else:
         raise ValueError(f"unknown DATA format: {data_format}")
-    used_fields = [name for name in names if not name.startswith("_") and layout[name].itemsize]
-    return points if len(used_fields) == len(names) else points[used_fields]
+    data_fields = [name for name in names if not name.startswith("_") and layout[name].itemsize]
+    return points if len(data_fields) == len(names) else points[data_fields]
 
 
 def parse_binary_points(data: bytes, layout: np.dtype, point_count: int) -> np.ndarray:
@@ -133,16 +140,13 @@ def _parse_numbers(words: np.ndarray, dtype: np.dtype, name: str) -> np.ndarray:
 
 
 def _parse_compressed_points(data: bytes, layout: np.dtype, point_count: int) -> np.ndarray:
-    """Parse binary_compressed data, which are stored field by field.
-
-    They are compressed with LZF, or plain if LZF would not make them smaller.
-    """
+    """Parse binary_compressed data: one column after the other, compressed with LZF unless that makes them larger."""
     compressed_size, size = struct.unpack_from("<II", data)
     if size != point_count * layout.itemsize or len(data) < 8 + compressed_size:
         raise ValueError("it is truncated: the sizes of the compressed points do not match")
-    plain = data[8 : 8 + compressed_size]
+    content = data[8 : 8 + compressed_size]
     try:
-        plain = decompress_lzf(plain, size)
+        content = decompress_lzf(content, size)
     except (ValueError, IndexError):
         if compressed_size != size:
             raise
@@ -151,7 +155,7 @@ def _parse_compressed_points(data: bytes, layout: np.dtype, point_count: int) ->
         field = layout[name]
         if field.itemsize:
             points[name] = np.frombuffer(
-                plain, field.base, point_count * field.itemsize // field.base.itemsize, offset
+                content, field.base, point_count * field.itemsize // field.base.itemsize, offset
             ).reshape((point_count, *field.shape))
         offset += point_count * field.itemsize
     return points

@@ -6,9 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_perception.data.pcd import MAX_CLOUD_BYTES, MAX_HEADER_BYTES, parse_binary_points, parse_text_points
-from lidar_perception.runs.files import check_regular
-from lidar_perception.types import InputError
+from lidar_perception.data.pcd import (
+    MAX_CLOUD_BYTES,
+    MAX_HEADER_BYTES,
+    parse_binary_points,
+    parse_text_points,
+    read_and_parse,
+)
 
 DTYPE_CODES = {
     "char": "i1",
@@ -39,17 +43,10 @@ def read_ply(path: Path) -> np.ndarray:
         (N,) structured array with the properties and types of the file, little-endian.
 
     Raises:
-        InputError: the file is not a PLY file, truncated, or has a list property in the vertices,
-            or in an element before them in a binary file.
+        InputError: the file is not a PLY file or is truncated; or the vertices, or in a binary file
+            an element before them, have a list property.
     """
-    try:
-        content = check_regular(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}; download it again") from None
-    try:
-        return _parse_vertices(content)
-    except (ValueError, TypeError, OverflowError, LookupError) as error:
-        raise InputError(f"{path} is not a readable PLY file ({error}); save it again as binary PLY") from None
+    return read_and_parse(path, _parse_vertices, "PLY")
 
 
 def _parse_vertices(content: bytes) -> np.ndarray:

@@ -12,7 +12,7 @@ from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import POINT_LABELS, POSES, Frame, PointTruth, Recording, return_none
 from lidar_perception.data.kitti import odometry
 from lidar_perception.data.kitti.folder import read_velodyne
-from lidar_perception.data.kitti.write import format_numbers, write_velodyne
+from lidar_perception.data.kitti.write import format_matrices, format_numbers, write_velodyne
 from lidar_perception.data.records import read_records
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import InputError, are_usable_returns
@@ -116,5 +116,4 @@ def format_pose(pose: np.ndarray, calibration: Calibration) -> str:
 
 def format_calibration(calibration: Calibration) -> str:
     """Format calib.txt, with the projections of four identical cameras and the pose of the LiDAR."""
-    rows = {**{f"P{i}": calibration.intrinsics for i in range(4)}, "Tr": calibration.lidar_to_camera[:3]}
-    return "".join(f"{name}: {format_numbers(matrix)}\n" for name, matrix in rows.items())
+    return format_matrices(calibration, Tr=calibration.lidar_to_camera[:3])

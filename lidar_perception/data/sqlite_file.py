@@ -47,7 +47,8 @@ class SqliteFile:
         ):
             if not isinstance(data, bytes) or not isinstance(time, int):
                 raise ValueError(
-                    f"a row has data of type {type(data).__name__} and time {time!r} instead of bytes and an integer"
+                    f"corrupt row: data of type {type(data).__name__} and timestamp {time!r}; "
+                    "expected bytes and an integer"
                 )
             yield topic, time, data
 

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidar_perception.camera import Calibration
-from lidar_perception.data.bag import LATCHED_QOS, BagWriter
+from lidar_perception.data.bag import BagWriter
+from lidar_perception.data.bag_metadata import LATCHED_QOS
 from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.types import GroundTruth, InputError, PointCloud
 from lidar_perception.wire.codec import make_bag_message
@@ -50,21 +51,19 @@ def write_bag(
     clouds: bool = True,
     detections_3d: bool = False,
 ) -> int:
-    """Write frames to a bag in order, and return the number of written frames.
+    """Write frames to a bag in order; return the number of frames that were written.
 
     The calibration is written to latched topics (CameraInfo, TransformStamped and TF) before the
     first scan and whenever it changes. Poses are written as odometry of the sensor, and point
     labels as columns of their cloud.
 
     Args:
-        path: folder of the bag.
-        frames: frames to write.
-        images: True to write the PNG images of the camera.
-        force: True to replace an existing bag.
+        images: write the PNG images of the camera.
+        force: replace an existing bag.
         skipped: list to which the errors of unreadable frames are added. If it is None, the first
             error is raised.
         clouds: False to write everything except clouds.
-        detections_3d: True to write the labelled boxes as Detection3DArray as well.
+        detections_3d: also write the labelled boxes as Detection3DArray.
 
     Raises:
         InputError: the bag cannot be written, or a frame cannot be read.

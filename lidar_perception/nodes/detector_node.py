@@ -1,11 +1,10 @@
-"""Base class of detector nodes, which load a network, run it and report problems."""
+"""Base class of the nodes that detect objects with a network."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from lidar_perception.detectors.contract import DetectionResult, join_problems
 from lidar_perception.detectors.custom import find_reference, load_custom_detector
@@ -24,79 +23,80 @@ from lidar_perception.wire.messages import read_cluster_ids, read_column
 from msg_utils.stamps import to_ns
 
 
-@dataclass(frozen=True)
-class NetworkLoader:
-    """Functions that load the detector of a node.
-
-    Attributes:
-        group: name of the detector's parameter group, a NetworkParams.
-        steps: names of the steps whose times are published.
-        find_weights: returns the path of the weights for the parameters of the group, without
-            importing torch; raises InputError if the file does not exist.
-        load: loads a detector from (weights, device, parameters of the node) and warms it up;
-            raises InputError if the weights cannot be used.
-        describe_network: returns the name of a network, given its configuration.
-        allows_custom: True if the parameter weights may be the module:Class of a custom detector.
-    """
-
-    group: str
-    steps: tuple[str, ...]
-    find_weights: Callable[[Any], Path]
-    load: Callable[[Path, str, Any], Any]
-    describe_network: Callable[[Any], str]
-    allows_custom: bool = False
-
-
 class DetectorNode(ManagedNode):
     """Detects objects with a network: ~/input/points -> ~/output/detections.
 
     Without a network, the node publishes nothing, because an empty array would mean an empty scene.
+
+    Attributes:
+        group: name of the detector and of its parameter group, a NetworkParams.
+        steps: names of the steps whose times are published.
+        allows_custom: True if the parameter weights may be the module:Class of a custom detector.
     """
 
-    def __init__(self, name: str, params: Any, loader: NetworkLoader, **options: Any):
-        super().__init__(name, params, DetectionNodeParams(), **options)
-        self.loader = loader
+    group: ClassVar[str]
+    steps: ClassVar[tuple[str, ...]]
+    detector: Any
+    allows_custom: ClassVar[bool] = False
+
+    def __init__(self, params: Any, **options: Any):
+        super().__init__(f"{self.group}_detector", params, DetectionNodeParams(), **options)
+
+    def find_weights(self) -> Path:
+        """Return the path of the weights, without importing torch.
+
+        Raises:
+            InputError: the file does not exist.
+        """
+        raise NotImplementedError
+
+    def load_detector(self, weights: Path, device: str) -> Any:
+        """Load the detector with the parameters of the node, and warm it up.
+
+        Raises:
+            InputError: the weights cannot be used.
+        """
+        raise NotImplementedError
+
+    def describe_network(self, config: Any) -> str:
+        """Return the name of the network with this configuration."""
+        raise NotImplementedError
 
     def configure(self) -> None:
         self.sensor = SensorCheck(self)
-        self.results = DetectionOutputs(self, self.loader.steps)
-        weights = self._get_network_params(self.params).weights
-        if self.loader.allows_custom and (reference := find_reference(weights)):
-            self._load_custom_detector(reference)
+        self.results = DetectionOutputs(self, self.steps)
+        network_params: Any = self._get_network_params(self.params)
+        if self.allows_custom and (reference := find_reference(network_params.weights)):
+            self.detector = load_custom_detector(
+                reference, network_params.device, network_params.range, params=self.params, group=self.group
+            )
+            name = reference
         else:
-            self._load_network()
+            self.detector = self._load_network()
+            name = self.describe_network(self.detector.networks[0].config)
+        self.diagnostics.counts.update(
+            network=f"{name}, {' '.join(self.detector.classes)}", device=self.detector.device
+        )
         self.inputs.subscribe("points", CLOUD, self.on_points)
 
     def _get_network_params(self, params: Any) -> NetworkParams:
-        network_params: NetworkParams = getattr(params, self.loader.group)
+        network_params: NetworkParams = getattr(params, self.group)
         return network_params
 
-    def _set_detector(self, detector: Any, name: str) -> None:
-        self.detector = detector
-        self.diagnostics.counts.update(network=f"{name}, {' '.join(detector.classes)}", device=detector.device)
-
-    def _load_custom_detector(self, reference: str) -> None:
-        group = self.loader.group
-        network_params: Any = getattr(self.params, group)
-        detector = load_custom_detector(
-            reference, network_params.device, network_params.range, params=self.params, group=group
-        )
-        self._set_detector(detector, reference)
-
-    def _load_network(self) -> None:
+    def _load_network(self) -> Any:
         with report_compilation(self.get_logger().info, full_detector=True):
             detector = self._load_on_device()
-        self._set_detector(detector, self.loader.describe_network(detector.networks[0].config))
         if detector.warning:  # not reported as the state, which shows what the node waits for
             self.diagnostics.counts["doubt"] = detector.warning
             self.get_logger().warning(detector.warning)
         if detector.fallback:
             self.diagnostics.report(WARN, detector.fallback)
+        return detector
 
     def _load_on_device(self) -> Any:
         """Load the detector, on the CPU if CUDA is missing and cpu_fallback is set."""
         network_params, fallback = self._get_network_params(self.params), None
-        weights = self.loader.find_weights(network_params)
+        weights = self.find_weights()
         from lidar_perception.detectors.devices import find_device
 
         # main.py sets the default to one thread.
@@ -108,7 +108,7 @@ class DetectorNode(ManagedNode):
             except InputError as error:
                 device, fallback = "cpu", f"{error}; falling back to the CPU"
         with lock_compilation(self.get_logger().info):
-            detector = self.loader.load(weights, device, self.params)
+            detector = self.load_detector(weights, device)
         detector.fallback = detector.fallback or fallback
         return detector
 
@@ -136,7 +136,7 @@ class DetectorNode(ManagedNode):
         if self.results.tracks is None:
             return params
         low = network_params.scores.limit_to(self.node_params.tracking.min_score)
-        return replace(params, **{self.loader.group: replace(network_params, scores=low)})
+        return replace(params, **{self.group: replace(network_params, scores=low)})
 
     def _diagnose(self, frame: PointCloud, result: DetectionResult, params: Any, tracking_problem: str | None) -> None:
         # result.problem includes problems of the intensity.
@@ -152,5 +152,5 @@ class DetectorNode(ManagedNode):
                 OK,
                 "detecting"
                 if len(result.detections)
-                else f"nothing detected: every score is below its threshold in {self.loader.group}.scores",
+                else f"nothing detected: every score is below its threshold in {self.group}.scores",
             )

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lidar_perception.detectors.fused.fusion import find_fused_weights
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams
-from lidar_perception.nodes.detector_node import DetectorNode, NetworkLoader
-
-if TYPE_CHECKING:
-    from lidar_perception.detectors.fused.detector import FusedDetector
-    from lidar_perception.detectors.pointpillars.config import NetworkConfig
+from lidar_perception.nodes.detector_node import DetectorNode
 
 
 class FusedNode(DetectorNode):
@@ -20,16 +16,18 @@ class FusedNode(DetectorNode):
     It uses the columns `ground` and `cluster_id` if the cloud has them.
     """
 
+    group, steps, allows_custom = "fused", STEPS, True
+
     def __init__(self, **options: Any):
-        loader = NetworkLoader("fused", STEPS, find_fused_weights, _load, _describe_network, allows_custom=True)
-        super().__init__("fused_detector", FusedDetectorParams(), loader, **options)
+        super().__init__(FusedDetectorParams(), **options)
 
+    def find_weights(self) -> Path:
+        return find_fused_weights(self.params.fused)
 
-def _load(weights: Path, device: str, params: FusedDetectorParams) -> FusedDetector:
-    from lidar_perception.detectors.fused.detector import load_fused_detector  # loads torch
+    def load_detector(self, weights: Path, device: str) -> Any:
+        from lidar_perception.detectors.fused.detector import load_fused_detector  # imports torch
 
-    return load_fused_detector(weights, device, params)
+        return load_fused_detector(weights, device, self.params)
 
-
-def _describe_network(config: NetworkConfig) -> str:
-    return f"PointPillars {config.version} {config.size} and PointNet"
+    def describe_network(self, config: Any) -> str:
+        return f"PointPillars {config.version} {config.size} and PointNet"

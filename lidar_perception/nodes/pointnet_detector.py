@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorParams
 from lidar_perception.detectors.weights_file import find_pointnet_weights
-from lidar_perception.nodes.detector_node import DetectorNode, NetworkLoader
-
-if TYPE_CHECKING:
-    from lidar_perception.detectors.pointnet.detector import PointNetDetector
+from lidar_perception.nodes.detector_node import DetectorNode
 
 
 class PointNetNode(DetectorNode):
@@ -19,12 +16,18 @@ class PointNetNode(DetectorNode):
     It uses the column `cluster_id`; without it, the node computes ground and clusters itself.
     """
 
+    group, steps = "pointnet", STEPS
+
     def __init__(self, **options: Any):
-        loader = NetworkLoader("pointnet", STEPS, find_pointnet_weights, _load, lambda config: config.name)
-        super().__init__("pointnet_detector", PointNetDetectorParams(), loader, **options)
+        super().__init__(PointNetDetectorParams(), **options)
 
+    def find_weights(self) -> Path:
+        return find_pointnet_weights(self.params.pointnet)
 
-def _load(weights: Path, device: str, params: PointNetDetectorParams) -> PointNetDetector:
-    from lidar_perception.detectors.pointnet.detector import load_pointnet_detector  # loads torch
+    def load_detector(self, weights: Path, device: str) -> Any:
+        from lidar_perception.detectors.pointnet.detector import load_pointnet_detector  # imports torch
 
-    return load_pointnet_detector(weights, device, params)
+        return load_pointnet_detector(weights, device, self.params)
+
+    def describe_network(self, config: Any) -> str:
+        return str(config.name)

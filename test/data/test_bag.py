@@ -20,7 +20,8 @@ from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 from samples import STAMP, png_header, scene, write
 
-from lidar_perception.data.bag import LATCHED_QOS, Bag, BagWriter
+from lidar_perception.data.bag import Bag, BagWriter
+from lidar_perception.data.bag_metadata import LATCHED_QOS
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag

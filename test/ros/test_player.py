@@ -18,7 +18,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, Bag, BagWriter
+from lidar_perception.data.bag import Bag, BagWriter
+from lidar_perception.data.bag_metadata import LATCHED_QOS, SENSOR_QOS
 from lidar_perception.nodes.diagnostics import WAITING
 from lidar_perception.nodes.interfaces import LATCHED
 from lidar_perception.wire.clouds import COMPRESSED, LIVOX

@@ -299,7 +299,7 @@ def test_missing_files_and_labels_are_reported(kitti, found, tmp_path, monkeypat
     assert "cannot read the split" in error("--results", found, "--split", tmp_path / "none")
     split = write(tmp_path / "split.txt", "000001 000007 000008")
     line = error("--results", found, "--split", split)
-    assert "lists 000007 (2 unknown names)" in line and str(kitti) in line
+    assert "such as 000007 (2 in all)" in line and str(kitti) in line
     assert "is empty" in error("--results", found, "--split", write(split, "\n"))
     (found / "000001.txt").unlink()
     assert f"result file {found / '000001.txt'} does not exist" in error("--results", found)

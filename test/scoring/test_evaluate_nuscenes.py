@@ -213,7 +213,7 @@ def test_invalid_scene_files_are_reported(root, tmp_path, monkeypatch, capsys):
     scenes.write_text("\n")
     assert "is empty" in error(scenes)
     scenes.write_text("scene-0103\nscene-9999\n")
-    assert "lists scene-9999 (1 unknown names)" in error(scenes)
+    assert "such as scene-9999 (1 in all)" in error(scenes)
 
 
 @pytest.mark.parametrize(

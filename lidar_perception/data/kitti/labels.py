@@ -36,35 +36,26 @@ def read_object_labels(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
     return to_ground_truth([label for _, label in parse_lines(path)], lidar_to_camera)
 
 
-def read_tracking_labels(path: Path, lidar_to_camera: np.ndarray, known_only: bool = False) -> dict[int, GroundTruth]:
+def read_tracking_labels(path: Path, lidar_to_camera: np.ndarray) -> dict[int, GroundTruth]:
     """Read the objects in a label_02 file by frame number; frames without objects are left out."""
     frames: dict[int, list[dict]] = {}
-    for _, frame, label in parse_tracking_lines(path, known_only):
+    for _, frame, label in parse_tracking_lines(path):
         frames.setdefault(frame, []).append(label)
     return {k: to_ground_truth(v, lidar_to_camera) for k, v in frames.items()}
 
 
 def parse_lines(path: Path, known_only: bool = False) -> list[tuple[int, dict]]:
-    """Parse all lines of a label_2 or result file.
-
-    Returns:
-        (line number starting at 1, label as returned by parse_label) of each line.
-    """
+    """Return (line number from 1, result of parse_label) for each line of a label_2 or result file."""
     return [(i, parse_label(line, path, i, known_only)) for i, line in _read_lines(path)]
 
 
-def parse_tracking_lines(path: Path, known_only: bool = False) -> list[tuple[int, int, dict]]:
-    """Parse all lines of a label_02 file.
-
-    Returns:
-        (line number starting at 1, frame number, label as returned by parse_label, with track_id)
-        of each line.
-    """
+def parse_tracking_lines(path: Path) -> list[tuple[int, int, dict]]:
+    """Return (line number from 1, frame number, result of parse_label with track_id) for each line of label_02"""
     labels = []
     for i, line in _read_lines(path):
         try:
             frame, track, rest = line.split(maxsplit=2)
-            labels.append((i, int(frame), dict(parse_label(rest, path, i, known_only), track_id=int(track))))
+            labels.append((i, int(frame), dict(parse_label(rest, path, i), track_id=int(track))))
         except ValueError as error:
             if isinstance(error, InputError):
                 raise
@@ -134,7 +125,13 @@ def to_ground_truth(labels: list[dict], lidar_to_camera: np.ndarray) -> GroundTr
             continue
         boxes.append(box)
         names.append(label["class"])
-        extras.append(extra if names[-1] in CLASSES else {**extra, "class_name": names[-1]})
+        extras.append(extra)
+    return _make_ground_truth(boxes, names, extras, notes)
+
+
+def _make_ground_truth(boxes: list, names: list[str], extras: list[dict], notes: list) -> GroundTruth:
+    """Make GroundTruth; unknown classes become Misc, with their name as class_name."""
+    extras = [extra if name in CLASSES else {**extra, "class_name": name} for name, extra in zip(names, extras)]
     return GroundTruth.of(boxes, find_class_ids(names), extras, notes)
 
 
@@ -180,11 +177,14 @@ def to_camera_box(box: np.ndarray, lidar_to_camera: np.ndarray) -> dict:
     centre = lidar_to_camera @ [x, y, z, 1.0]
     # Find the rotation about the camera's y axis that corresponds to this yaw in the LiDAR frame. The
     # vertical axes of camera and LiDAR are not parallel.
-    right, ahead = lidar_to_camera[0, :2], lidar_to_camera[2, :2]
+    right_axis, forward_axis = lidar_to_camera[0, :2], lidar_to_camera[2, :2]
     rotation = float(
-        np.arctan2(right[1] * np.cos(yaw) - right[0] * np.sin(yaw), ahead[1] * np.cos(yaw) - ahead[0] * np.sin(yaw))
+        np.arctan2(
+            right_axis[1] * np.cos(yaw) - right_axis[0] * np.sin(yaw),
+            forward_axis[1] * np.cos(yaw) - forward_axis[0] * np.sin(yaw),
+        )
     )
-    if (np.cos(rotation) * right - np.sin(rotation) * ahead) @ [np.cos(yaw), np.sin(yaw)] < 0:
+    if (np.cos(rotation) * right_axis - np.sin(rotation) * forward_axis) @ [np.cos(yaw), np.sin(yaw)] < 0:
         rotation = float(wrap_angle(rotation + np.pi))
     location = [float(centre[0]), float(centre[1] + h / 2), float(centre[2])]
     alpha = float(wrap_angle(rotation - np.arctan2(location[0], location[2])))
@@ -228,11 +228,11 @@ def read_tracklets(path: Path) -> dict[int, GroundTruth]:
     Raises:
         InputError: the file cannot be read, or has another format.
     """
-    frames: dict[int, tuple[list, list]] = {}
+    frames: dict[int, tuple[list, list, list, list]] = {}  # number -> boxes, class names, extras, notes
     try:
         tracklets = _find_child(ElementTree.parse(check_regular(path)).getroot(), "tracklets")
         for track, item in enumerate(tracklets.iterfind("item")):
-            text = _find_text(item, "objectType").strip()
+            name = find_class_name(_find_text(item, "objectType").strip())
             h, w, length = (float(_find_text(item, k)) for k in "hwl")
             first_frame = int(item.findtext("first_frame") or 0)
             for i, pose in enumerate(_find_child(item, "poses").iterfind("item")):
@@ -241,23 +241,16 @@ def read_tracklets(path: Path) -> dict[int, GroundTruth]:
                 if truncated is None:
                     continue
                 extra = {"track_id": track, "occluded": int(occluded or 0), "truncated": truncated}
-                boxes, notes = frames.setdefault(first_frame + i, ([], []))
+                boxes, names, extras, notes = frames.setdefault(first_frame + i, ([], [], [], []))
                 if min(h, w, length) <= 0:
-                    notes.append((find_class_name(text), extra))
-                else:
-                    boxes.append(([x, y, z + h / 2, length, w, h, yaw], text, extra))
+                    notes.append((name, extra))
+                    continue
+                boxes.append([x, y, z + h / 2, length, w, h, yaw])
+                names.append(name)
+                extras.append(extra)
     except (OSError, ElementTree.ParseError, ValueError, OverflowError) as error:
         raise InputError(f"cannot read the tracklets {path}: {error}") from None
-    return {number: _to_tracklet_truth(*content) for number, content in frames.items()}
-
-
-def _to_tracklet_truth(rows: list, notes: list) -> GroundTruth:
-    boxes, texts, extras = (list(column) for column in zip(*rows)) if rows else ([], [], [])
-    extras = [
-        extra if find_class_name(text) in CLASSES else {**extra, "class_name": text}
-        for text, extra in zip(texts, extras)
-    ]
-    return GroundTruth.of(boxes, find_class_ids(texts), extras, notes)
+    return {number: _make_ground_truth(*content) for number, content in frames.items()}
 
 
 def _parse_state(pose: ElementTree.Element, name: str) -> float | None:

@@ -43,18 +43,18 @@ def project_boxes(boxes: np.ndarray, calibration: Calibration) -> tuple[np.ndarr
     is_crossing = (depth < MIN_DEPTH_M) & (other_depth > MIN_DEPTH_M)
     fraction = (MIN_DEPTH_M - depth) / np.where(is_crossing, other_depth - depth, 1.0)
     clipped_ends = np.where(is_crossing[..., None], ends + fraction[..., None] * (other_ends - ends), ends)
-    in_front = ((depth >= MIN_DEPTH_M) | is_crossing)[..., None]
+    is_in_front = ((depth >= MIN_DEPTH_M) | is_crossing)[..., None]
     pixels = clipped_ends @ calibration.intrinsics.T
-    pixels = pixels[..., :2] / np.where(in_front, pixels[..., 2:], 1.0)
-    low = np.where(in_front, pixels, np.inf).min(axis=(1, 2))
-    high = np.where(in_front, pixels, -np.inf).max(axis=(1, 2))
-    max_pixel = np.array([calibration.width, calibration.height]) - 1
-    clipped_low, clipped_high = np.clip(low, 0, max_pixel), np.clip(high, 0, max_pixel)
-    in_image = ((clipped_high - clipped_low) >= MIN_PIXELS).all(axis=1)
+    pixels = pixels[..., :2] / np.where(is_in_front, pixels[..., 2:], 1.0)
+    min_pixel = np.where(is_in_front, pixels, np.inf).min(axis=(1, 2))
+    max_pixel = np.where(is_in_front, pixels, -np.inf).max(axis=(1, 2))
+    last_pixel = np.array([calibration.width, calibration.height]) - 1
+    clipped_min, clipped_max = np.clip(min_pixel, 0, last_pixel), np.clip(max_pixel, 0, last_pixel)
+    is_in_image = ((clipped_max - clipped_min) >= MIN_PIXELS).all(axis=1)
     with np.errstate(invalid="ignore"):
-        outside_fraction = 1 - np.prod(clipped_high - clipped_low, axis=1) / np.prod(high - low, axis=1)
-    boxes_2d = np.concatenate([clipped_low, clipped_high], axis=1)
-    return np.where(in_image[:, None], boxes_2d, np.nan), np.where(in_image, outside_fraction, 1.0)
+        outside_fraction = 1 - np.prod(clipped_max - clipped_min, axis=1) / np.prod(max_pixel - min_pixel, axis=1)
+    boxes_2d = np.concatenate([clipped_min, clipped_max], axis=1)
+    return np.where(is_in_image[:, None], boxes_2d, np.nan), np.where(is_in_image, outside_fraction, 1.0)
 
 
 def keep_visible_objects(truth: GroundTruth, calibration: Calibration) -> GroundTruth:
@@ -92,12 +92,13 @@ def format_tracking_line(number: int, track: int, label: dict) -> str:
 
 def format_calibration(calibration: Calibration) -> str:
     """Format the text of a calib file, with four identical rectified cameras."""
-    matrices = {
-        **{f"P{i}": calibration.intrinsics for i in range(4)},
-        "R0_rect": np.eye(3),
-        "Tr_velo_to_cam": calibration.lidar_to_camera[:3],
-        "Tr_imu_to_velo": IMU_TO_LIDAR,
-    }
+    to_camera = calibration.lidar_to_camera[:3]
+    return format_matrices(calibration, R0_rect=np.eye(3), Tr_velo_to_cam=to_camera, Tr_imu_to_velo=IMU_TO_LIDAR)
+
+
+def format_matrices(calibration: Calibration, **matrices: np.ndarray) -> str:
+    """Format the projections of four identical cameras and further matrices, one per line."""
+    matrices = {f"P{i}": calibration.intrinsics for i in range(4)} | matrices
     return "".join(f"{name}: {format_numbers(matrix)}\n" for name, matrix in matrices.items())
 
 

@@ -33,12 +33,12 @@ def to_results(detections: Detections, frame: Frame) -> GlobalBoxes:
         raise InputError(f"{frame.name}: a box or score of the detector is not finite; check its weights and its input")
     nuscenes_ids = np.array([NAMES.index(NAME_BY_CLASS[name]) if name in NAME_BY_CLASS else -1 for name in CLASSES])
     class_ids = nuscenes_ids[detections.class_ids]
-    selected = np.flatnonzero(class_ids >= 0)
-    selected = selected[np.argsort(-detections.scores[selected], kind="stable")][:MAX_BOXES]
+    indices = np.flatnonzero(class_ids >= 0)
+    indices = indices[np.argsort(-detections.scores[indices], kind="stable")][:MAX_BOXES]
     return GlobalBoxes.of(
-        *to_global_boxes(detections.boxes[selected], frame.native.pose),
-        class_ids[selected],
-        scores=detections.scores[selected],
+        *to_global_boxes(detections.boxes[indices], frame.native.pose),
+        class_ids[indices],
+        scores=detections.scores[indices],
     )
 
 

@@ -142,6 +142,6 @@ class Tables:
             or not (np.abs(column) <= MAX_NUMBER).all()
             or (field == "rotation" and not are_valid_rotations(column).all())
         ):
-            expected = "a quaternion" if field == "rotation" else f"{width} finite numbers within {MAX_NUMBER:g}"
-            raise InputError(f"{self.path(table)}: a {field} is not {expected}; download it again")
+            requirement = "a quaternion" if field == "rotation" else f"{width} finite numbers within {MAX_NUMBER:g}"
+            raise InputError(f"{self.path(table)}: a {field} is not {requirement}; download it again")
         return column

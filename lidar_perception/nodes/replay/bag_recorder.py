@@ -12,7 +12,8 @@ from typing import Any
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, BagWriter
+from lidar_perception.data.bag import BagWriter
+from lidar_perception.data.bag_metadata import LATCHED_QOS, SENSOR_QOS
 from lidar_perception.nodes.diagnostics import OK, WARN
 from lidar_perception.nodes.links import Output, Receive, find_only_output, to_cdr
 from lidar_perception.nodes.runtime import LidarNode
