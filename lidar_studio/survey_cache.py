@@ -17,14 +17,13 @@ from lidar_perception import __version__
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.runs.files import shorten_error, write_bytes
 from lidar_perception.runs.resuming import find_differences
-from lidar_perception.types import Detections, InputError
+from lidar_perception.types import Detections
 from lidar_studio.drive import Drive
 from lidar_studio.survey import FrameSurvey
 
 Array = np.ndarray[Any, Any]
 FOLDER, LAYOUT = "survey", 2
 FRAMES_PER_FILE = 20
-MAX_BYTES = 300 * 10**6  # limit for all files together; 1,000 frames take about 30 MB
 PARTS = "detections", "classes", "scores", "boxes", "images", "features", "things"
 
 
@@ -63,7 +62,7 @@ def write(folder: Path, key: str, first: int, surveys: Sequence[FrameSurvey]) ->
         surveys: Surveys of FRAMES_PER_FILE frames, or fewer at the end of the drive.
 
     Raises:
-        InputError: The file cannot be written, or the cache would become too large.
+        InputError: The file cannot be written.
     """
     columns: list[list[Array]] = [[] for _ in PARTS]
     names = sorted({name for survey in surveys for name in survey.features})
@@ -90,11 +89,6 @@ def write(folder: Path, key: str, first: int, surveys: Sequence[FrameSurvey]) ->
     poses = [survey.pose for survey in surveys if survey.pose is not None]
     content = io.BytesIO()
     np.savez_compressed(content, key=np.array(key), names=np.array(names, str), poses=np.array(poses), **arrays)
-    size = content.getbuffer().nbytes + sum(p.stat().st_size for p in folder.glob("*.npz"))
-    if size > MAX_BYTES:
-        raise InputError(
-            f"the survey takes more than {MAX_BYTES / 1e6:.0f} MB, so only the frames before {first} are cached"
-        )
     write_bytes(folder / _file_name(first), content.getbuffer())
 
 

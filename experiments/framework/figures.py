@@ -13,12 +13,10 @@ GREY = "#888888"
 MAX_COLUMNS = 3  # maximum number of panels side by side
 
 
-def encode_figure(figure: Figure | Picture, *, dark: bool = False) -> str:
+def encode_figure(figure: Figure | Picture) -> str:
     """Return a figure as a data URL for the HTML page."""
     kind, content = (
-        ("png", _encode_picture(figure))
-        if isinstance(figure, Picture)
-        else ("svg+xml", draw_figure(figure, "svg", dark=dark))
+        ("png", _encode_picture(figure)) if isinstance(figure, Picture) else ("svg+xml", draw_figure(figure, "svg"))
     )
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
@@ -36,7 +34,7 @@ def _encode_picture(picture: Picture) -> bytes:
     return stream.getvalue()
 
 
-def draw_figure(figure: Figure, kind: str = "svg", *, dark: bool = False) -> bytes:
+def draw_figure(figure: Figure, kind: str = "svg") -> bytes:
     """Draw a figure as svg or png: panels side by side, with one legend.
 
     Equal figures give equal bytes.
@@ -45,17 +43,9 @@ def draw_figure(figure: Figure, kind: str = "svg", *, dark: bool = False) -> byt
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
 
-    background, foreground, grid = ("#16181c", "#d8dade", "#34383f") if dark else ("white", "black", "#e3e3e3")
     style: Any = {
-        "figure.facecolor": background,
-        "axes.facecolor": background,
-        "savefig.facecolor": background,
-        "text.color": foreground,
-        "axes.labelcolor": foreground,
         "axes.edgecolor": GREY,
-        "xtick.color": foreground,
-        "ytick.color": foreground,
-        "grid.color": grid,
+        "grid.color": "#e3e3e3",
         "font.size": 9,
         "legend.frameon": False,
         "svg.hashsalt": figure.name,

@@ -11,7 +11,13 @@ from experiments.realism.report import print_realism
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import data_argument, open_and_describe, out_file_option, write_json
+from lidar_perception.cli.data import (
+    data_argument,
+    open_and_describe,
+    out_file_option,
+    simulated_height_option,
+    write_json,
+)
 from lidar_perception.data.frame import BOXES
 from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.simulation.recording import simulate_frames
@@ -24,13 +30,7 @@ from lidar_perception.simulation.sensor import find_sensor
 @click.option(
     "--sensor", default="hdl64e", show_default=True, help="Sensor to simulate, as in `lidar-perception simulate`."
 )
-@click.option(
-    "--mount-height",
-    type=click.FloatRange(0, 10),
-    default=0.0,
-    metavar="M",
-    help="Height of the sensor above the ground. Default: the height in its file or preset.",
-)
+@simulated_height_option
 @click.option(
     "--frames",
     type=click.IntRange(1),

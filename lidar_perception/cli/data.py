@@ -124,6 +124,19 @@ def data_argument(
     return decorate
 
 
+def make_mount_height_option(default: str) -> Callable:
+    """Return the option --mount-height, with a description of the height without it."""
+    return click.option(
+        "--mount-height",
+        type=click.FloatRange(0, 10),
+        default=0.0,
+        metavar="M",
+        help=f"Height of the sensor above the ground. Default: {default}.",
+    )
+
+
+mount_height_option = make_mount_height_option("the height in the recording, or measured on its first clouds")
+simulated_height_option = make_mount_height_option("the height in its file or preset")
 split_option = path_option("--split", "Use only the frames or sequences named in this file, one per line.")
 limit_option = click.option("--limit", type=click.IntRange(1), metavar="N", help="Only the first N frames.")
 jobs_option = click.option(

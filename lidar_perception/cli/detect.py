@@ -15,6 +15,7 @@ from lidar_perception.cli.data import (
     data_argument,
     jobs_option,
     limit_option,
+    mount_height_option,
     open_and_describe,
     out_file_option,
     out_folder_option,
@@ -66,14 +67,7 @@ class Formats(click.ParamType):
     metavar="SCORE",
     help="Minimum score of a box of any class. Default: the thresholds of the detector.",
 )
-@click.option(
-    "--mount-height",
-    type=click.FloatRange(0, 10),
-    default=0.0,
-    metavar="M",
-    help="Height of the sensor above the ground. Default: the height in the recording, or measured on its first "
-    "clouds.",
-)
+@mount_height_option
 @click.option(
     "--track", is_flag=True, help="Write tracks, with ids and velocities, instead of separate boxes for each frame."
 )

@@ -10,7 +10,7 @@ import click
 
 from lidar_perception import __version__
 from lidar_perception.cli.command import Choice, Command
-from lidar_perception.cli.data import out_folder_option
+from lidar_perception.cli.data import out_folder_option, simulated_height_option
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.labels.names import ALIASES
 from lidar_perception.runs.compiling import report_compilation
@@ -45,13 +45,7 @@ from lidar_perception.types import InputError
     help=f"One of {', '.join(SENSOR_NAMES)}, in any spelling (hdl64e is hdl-64e), a "
     f".yaml file (`setup` writes one), or {GENERIC_FORMAT}.",
 )
-@click.option(
-    "--mount-height",
-    type=click.FloatRange(0, 10),
-    default=0.0,
-    metavar="M",
-    help="Height of the sensor above the ground. Default: the height in its file or preset.",
-)
+@simulated_height_option
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True, help="Number of scans.")
 @click.option(
     "--seed",

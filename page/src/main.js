@@ -10,13 +10,13 @@ import { openLive } from "./live.js";
 import { showError } from "./messages.js";
 import { loadResults } from "./results.js";
 import { openResultPanel } from "./resultpanel.js";
-import { draw, drawStats, focusSelection, moveCamera, limits, lookAt, openScene } from "./scene.js";
+import { focusSelection, lookAt, openScene } from "./scene.js";
 import { openSideViews } from "./sideviews.js";
 import { notify, on, select, store } from "./store.js";
 import { openTimeline } from "./timeline.js";
 import { openTopbar } from "./topbar.js";
 import { openTrackList } from "./tracklist.js";
-import { findPointAt, project } from "./picking.js";
+import { project } from "./picking.js";
 
 async function open() {
   openTopbar();
@@ -55,6 +55,6 @@ async function open() {
   }));
 }
 
-// Access for tests, screenshots and measurements. The page itself does not use it.
-globalThis.page = { store, draw, drawStats, findPointAt, project, moveCamera, limits, lookAt };
+// Access for tests and screenshots. The page itself does not use it.
+globalThis.page = { store, project, lookAt };
 open();

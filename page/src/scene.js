@@ -4,10 +4,10 @@ import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { getTheme } from "./colours.js";
 import { beforeDrawing } from "./dom.js";
-import { highlightPoints, openPoints, getPointCount, render, setPointSize, setPoints, limitPoints } from "./points.js";
+import { highlightPoints, openPoints, render, setPointSize, setPoints, limitPoints } from "./points.js";
 import { on, getSelectedBox, store } from "./store.js";
 
-export const limits = { movingPoints: 30_000 }; // number of random points to draw while the camera moves
+const MOVING_POINTS = 30_000; // number of random points to draw while the camera moves
 const REST_MS = 160; // the camera stands still if it has not moved for this time
 const BACKGROUND = { dark: 0x11151c, light: 0xf5f7fa };
 const RING_RADII_M = [10, 20, 40, 60, 80];
@@ -41,17 +41,12 @@ function isSoftwareRendered() {
 
 /** Functions that are called after each drawing, for overlays. */
 export const afterDrawing = [];
-export const drawStats = { ms: 0, count: 0, points: 0 }; // statistics of the last drawing, for page/measure.py
 
 let restTimer = 0, isCameraStill = true;
 
 export const draw = beforeDrawing(() => {
-  const start = performance.now();
   render(renderer, scene, camera, isSoftware && isCameraStill && !store.playing);
   for (const callback of afterDrawing) callback();
-  drawStats.ms = performance.now() - start;
-  drawStats.count += 1;
-  drawStats.points = getPointCount();
 });
 
 function onCameraMove() {
@@ -65,7 +60,7 @@ controls.addEventListener("change", onCameraMove);
 function setMoving(isMoving) {
   isCameraStill = !isMoving;
   const count = store.cloud?.count ?? 0;
-  limitPoints(isMoving || store.playing ? Math.min(limits.movingPoints, count) : count);
+  limitPoints(isMoving || store.playing ? Math.min(MOVING_POINTS, count) : count);
   draw();
 }
 

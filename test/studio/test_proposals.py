@@ -212,15 +212,6 @@ def test_survey_of_another_drive_is_replaced_and_reported(drive, tmp_path, monke
     assert surveys == [] and "weights '', not 'pointpillars'" in message
 
 
-def test_survey_cache_is_bounded(drive, tmp_path, monkeypatch):
-    monkeypatch.setattr(survey_cache, "FRAMES_PER_FILE", 2)
-    monkeypatch.setattr(survey_cache, "MAX_BYTES", 60_000)
-    progress, messages, tracks = run_survey(drive, tmp_path)
-    assert len(progress) == FRAMES and tracks and "are cached" in messages
-    sizes = [len(content) for content in read_cache(tmp_path).values()]
-    assert 0 < len(sizes) < FRAMES / 2 and sum(sizes) <= 60_000
-
-
 @pytest.mark.parametrize("is_restarted", [False, True])
 def test_seed_corrected_before_tracking_is_tracked(drive, tmp_path, monkeypatch, is_restarted):
     monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)

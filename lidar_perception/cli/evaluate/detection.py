@@ -13,6 +13,7 @@ from lidar_perception.cli.command import Command, refuse_options
 from lidar_perception.cli.data import (
     ScoringOptions,
     intervals_option,
+    mount_height_option,
     no_labels_error,
     out_folder_option,
     path_option,
@@ -148,14 +149,7 @@ def _print_scores(content: dict[str, Any]) -> None:
     metavar="FRACTION",
     help="Keep only this fraction (0 to 1) of the points of each scan, drawn with a fixed seed. Default: 1.",
 )
-@click.option(
-    "--mount-height",
-    type=click.FloatRange(0, 10),
-    default=0.0,
-    metavar="M",
-    help="Height of the sensor above the ground. Default: the height in the recording, or measured on its first "
-    "clouds.",
-)
+@mount_height_option
 @out_folder_option(
     "Write the detections of --weights as KITTI result files, also for frames without labels.", "--write-results"
 )
