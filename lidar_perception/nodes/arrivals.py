@@ -25,7 +25,7 @@ class Arrivals:
         self.sequence: int | None = None  # number of the last cloud
         self.window: deque[tuple[int, int, int]] = deque([(0, 0, 0)], WINDOW + 1)  # (sent, lost, dropped)
         self.stamps: deque[tuple[int, int]] = deque(maxlen=RATE_SAMPLES + 1)  # (sequence number, time of sending in ns)
-        self.learned: float | None = None  # expected rate, Hz
+        self.expected_rate: float | None = None  # rate of the first clouds, Hz; None before it is known
 
     def add(self, infos: list[dict], dropped: int, one_publisher: bool = True) -> None:
         """Count messages.
@@ -49,10 +49,10 @@ class Arrivals:
             self.stamps.append((self.sent, info["source_timestamp"]))
         self.dropped += dropped
         self.window.append((self.sent, self.lost, self.dropped))
-        if self.learned is None and len(self.stamps) > RATE_SAMPLES:
+        if self.expected_rate is None and len(self.stamps) > RATE_SAMPLES:
             intervals = np.diff(np.array(self.stamps, float), axis=0)
             period = np.median(intervals[:, 1] / intervals[:, 0])
-            self.learned = 1e9 / period if period > 0 else None
+            self.expected_rate = 1e9 / period if period > 0 else None
 
     def record_interruption(self, dropped: int) -> None:
         """Count the waiting clouds as dropped, and do not count the gap until the next cloud."""

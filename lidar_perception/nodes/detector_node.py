@@ -123,11 +123,12 @@ class DetectorNode(ManagedNode):
                 ground=None if ground is None else ground > 0,
                 cluster_ids=None if clusters is None else clusters[0],
             )
-            tracked = result.detections  # includes weak detections for the tracker
+            all_detections = result.detections  # with tracking, also those below the score thresholds
             if self.results.tracks is not None:
-                result = replace(result, detections=tracked[network_params.scores.passes(tracked)])
+                has_passed = network_params.scores.passes(all_detections)
+                result = replace(result, detections=all_detections[has_passed])
             tracking_problem = self.results.publish(
-                msg.header, result.detections, result.timings, frame.xyz, tracked=tracked
+                msg.header, result.detections, result.timings, frame.xyz, tracker_input=all_detections
             )
         self._diagnose(frame, result, params, tracking_problem)
 

@@ -53,7 +53,7 @@ class EgoInput:
         self.icp_restarts = 0  # counted because the origin of the poses changes with each restart
         self.icp_ms: deque[float] = deque(maxlen=TIMED_SCANS)  # CPU time of KISS-ICP for the last scans
         self.pose_problem = ""  # why the last frame has no pose
-        self.without_ns: int | None = None  # stamp of the first frame without a pose (ego.source auto)
+        self.first_unknown_ns: int | None = None  # stamp of the first frame without a pose (ego.source auto)
         self.late_since: float | None = None  # monotonic time at which poses began to be late
         setting = params().source
         if setting in ("auto", "odometry"):
@@ -63,7 +63,7 @@ class EgoInput:
         elif setting == "kiss_icp":
             self._start_icp()
         if clouds:
-            self.transforms.more_needs.append(self.find_missing_pose)
+            self.transforms.other_checks.append(self.find_missing_pose)
 
     def find_pose(self, header: Any, xyz: np.ndarray | None = None) -> np.ndarray | None:
         """Return the (4, 4) pose of the frame with this header, or None if it is unknown.
@@ -205,12 +205,12 @@ class EgoInput:
     def _try_next_source(self, stamp: int, has_pose: bool) -> None:
         """Fall back to TF if there is no odometry, and to KISS-ICP if there is no pose in TF either."""
         if self.source in ("odometry", "tf") or has_pose:
-            self.without_ns = None
+            self.first_unknown_ns = None
             return
         self.transforms.subscribe_to_tf()
-        if self.without_ns is None or stamp < self.without_ns:
-            self.without_ns = stamp
-        if stamp - self.without_ns >= GRACE_NS and self.icp is None and has_odometry():
+        if self.first_unknown_ns is None or stamp < self.first_unknown_ns:
+            self.first_unknown_ns = stamp
+        if stamp - self.first_unknown_ns >= GRACE_NS and self.icp is None and has_odometry():
             self._start_icp()
 
     def _start_icp(self) -> None:

@@ -34,7 +34,7 @@ class GroundSegmentation(ManagedNode):
     """
 
     # Points (M, 3) in the level frame and mask (M,) of the ground, for the diagnostics.
-    last_segmented = np.zeros((0, 3), np.float32), np.zeros(0, bool)
+    last_result = np.zeros((0, 3), np.float32), np.zeros(0, bool)
 
     def __init__(self, **options: Any):
         super().__init__("ground_segmentation", GroundNodeParams(), GroundExtraParams(), **options)
@@ -77,13 +77,13 @@ class GroundSegmentation(ManagedNode):
         self._publish_parts(
             msg, visible_frame, visible_indices, params, ground if self.node_params.range == "all" else None
         )
-        self.last_segmented = segmented_frame.xyz, ground
+        self.last_result = segmented_frame.xyz, ground
         problem = diagnose_empty(len(frame), ground) or self.sensor.find_problem(frame, params)
         self.diagnostics.report(WARN if problem else OK, problem or "segmenting")
 
     def values(self) -> dict[str, Any]:
         """Return the lifecycle state, and the plane through the ground of the last cloud."""
-        xyz, ground = self.last_segmented
+        xyz, ground = self.last_result
         plane = fit_plane(xyz.compress(ground, axis=0))
         if plane is None:
             return super().values()

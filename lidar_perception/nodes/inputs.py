@@ -1,4 +1,4 @@
-"""Inputs shared by several nodes: the camera, and seeds for each cloud."""
+"""Inputs shared by several nodes: the camera calibration, and the seeds of each cloud."""
 
 from __future__ import annotations
 
@@ -133,11 +133,11 @@ class StampMatcher:
 
     def _drop_if_time_jumped_back(self, stamp_ns: int) -> None:
         """Drop all pending messages if they are more than JUMP_NS ahead of stamp_ns."""
-        for pending in (self.clouds, self.partners):
-            if pending and next(reversed(pending)) > stamp_ns + JUMP_NS:
-                if pending is self.clouds:
-                    self.on_drop(len(pending))
-                pending.clear()
+        for messages in (self.clouds, self.partners):
+            if messages and next(reversed(messages)) > stamp_ns + JUMP_NS:
+                if messages is self.clouds:
+                    self.on_drop(len(messages))
+                messages.clear()
 
 
 class SeedInput:
@@ -165,7 +165,7 @@ class SeedInput:
                 warm_up_automatic_seed()
 
     def open(self) -> None:
-        """Do nothing: the subscriptions of the node are opened by the node."""
+        """Do nothing; the node opens its subscriptions."""
 
     def close(self) -> None:
         """Drop pending messages, which would be too old when the node is active again."""
@@ -205,7 +205,8 @@ class SeedInput:
     def _deliver_with_truth(self, cloud: Any, truth: Any) -> None:
         if truth is None:
             self.deliver(
-                cloud, _raise_missing("no ground truth for this cloud; is it published with the same header.stamp?")
+                cloud,
+                _make_failing_source("no ground truth for this cloud; is it published with the same header.stamp?"),
             )
         else:
             people = truth.select_class(PEDESTRIAN)
@@ -250,7 +251,9 @@ class SeedInput:
         return seed
 
 
-def _raise_missing(reason: str) -> SeedSource:
+def _make_failing_source(reason: str) -> SeedSource:
+    """Return a seed source that raises InputError with this reason."""
+
     def raise_error(segmented: SegmentedCloud) -> tuple[Seed, ...]:
         raise InputError(reason)
 

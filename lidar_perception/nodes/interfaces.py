@@ -1,4 +1,4 @@
-"""Message types and QoS profiles of the topics of nodes."""
+"""Message types and QoS profiles of the nodes' topics."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 MARKERS = "visualization_msgs/msg/MarkerArray"
+DETECTIONS_3D = "vision_msgs/msg/Detection3DArray"
 
 SENSOR_DATA = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = QoSProfile(depth=10)

@@ -63,7 +63,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         self.diagnostics.state = (OK, UNCONFIGURED)
         self.diagnostics.sources.append(self)
         self.autostart = Autostart(self, watched_inputs)
-        self._unconfigured: NodeSnapshot | None = None
+        self._snapshot: NodeSnapshot | None = None  # state before configure()
         wrap_change_state(self, self._change)
 
     def configure(self) -> None:
@@ -115,7 +115,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         self.autostart.unmanaged_since = None
-        self._unconfigured = NodeSnapshot(self)
+        self._snapshot = NodeSnapshot(self)
         if self.autostart.retry_at is None:
             self.diagnostics.report(WARN, "configuring", expected=True)
         state_before = self.diagnostics.state
@@ -162,8 +162,8 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         return SUCCESS
 
     def _undo_configuration(self) -> None:
-        if self._unconfigured is not None:
-            self._unconfigured.restore()
+        if self._snapshot is not None:
+            self._snapshot.restore()
 
     def _run_step(self, step: Callable[[], Any]) -> str | None:
         """Run step() and return its error message, or None. Log the traceback of unexpected errors once."""
@@ -197,9 +197,9 @@ class NodeSnapshot:
         self.node.outputs.clear()
         self.node.diagnostics.sources = [*self.sources]
         self.node.diagnostics.reset()
-        preserved = [*self.entities, get_clock_subscription(self.node)]
+        kept_entities = [*self.entities, get_clock_subscription(self.node)]
         for kind, destroy in ENTITIES.items():
-            for entity in [e for e in getattr(self.node, kind) if e not in preserved]:
+            for entity in [e for e in getattr(self.node, kind) if e not in kept_entities]:
                 destroy(self.node, entity)
         release_memory()
 

@@ -1,9 +1,10 @@
-"""Publishers of detections, clusters and obstacles, shared by several nodes."""
+"""Publishers of detections, cluster boxes and obstacles, shared by several nodes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,15 +14,15 @@ from lidar_perception.candidates.refine import Candidates
 from lidar_perception.clustering.shapes import classify_by_diagonal
 from lidar_perception.ground.obstacles import find_obstacles
 from lidar_perception.nodes.diagnostics import OK, WARN
-from lidar_perception.nodes.interfaces import CLOUD, MARKERS, RELIABLE
+from lidar_perception.nodes.interfaces import CLOUD, DETECTIONS_3D, RELIABLE
 from lidar_perception.nodes.runtime import LidarNode
-from lidar_perception.nodes.track_outputs import DETECTIONS_3D, TrackOutputs, find_marker_lifetime_ns, has_detections_3d
+from lidar_perception.nodes.track_outputs import MarkerOutput, TrackOutputs, has_detections_3d
 from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.array_codec import encode_detection_array
 from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import make_detection_rows, make_xyz_cloud
-from msg_utils.markers import MarkerRows, list_marker_keys, make_marker_rows
+from msg_utils.markers import make_marker_rows
 from msg_utils.messages import load_message_class
 from msg_utils.stamps import make_header, to_ns
 
@@ -43,31 +44,22 @@ class ClusterBoxes:
     """Publisher of ~/output/boxes, which are computed only while there are subscribers."""
 
     def __init__(self, node: LidarNode):
-        self.node = node
-        self.publisher = node.outputs.advertise("boxes", MARKERS)
-        self.marker_keys: Any = ()
+        self.node, self.markers = node, MarkerOutput(node, "boxes")
 
-    def publish(self, header: Any, boxes: Callable[[], np.ndarray]) -> None:
-        if self.publisher.get_subscription_count():
-            header, output = to_output_frame(self.node, header, boxes())
-            ids = range(1, len(output) + 1)  # the ids in the column cluster_id
-            rows = make_marker_rows(
-                output,
-                ["cluster"] * len(output),
-                ids=ids,
-                previous=self.marker_keys,
-                extras=_make_marker_texts(output, ids),
-            )
-            self.marker_keys = list_marker_keys(rows)
-            self.publisher.publish(MarkerRows(rows, header, find_marker_lifetime_ns(self.node)))
-
-
-def _make_marker_texts(boxes: np.ndarray, ids: Sequence[int]) -> list[dict]:
-    """Return the text of each marker: the id, and the class by the size of the box."""
-    return [
-        {"id": i, **({"size_class": CLASSES[c]} if c >= 0 else {})}
-        for i, c in zip(ids, classify_by_diagonal(boxes), strict=True)
-    ]
+    def publish(self, header: Any, fit_boxes: Callable[[], np.ndarray]) -> None:
+        """Publish the boxes that fit_boxes() returns. Texts have the id, and the class by the size of the box."""
+        if not self.markers.publisher.get_subscription_count():
+            return
+        header, boxes = to_output_frame(self.node, header, fit_boxes())
+        ids = range(1, len(boxes) + 1)  # the ids in the column cluster_id
+        texts = [
+            {"id": i, **({"size_class": CLASSES[class_id]} if class_id >= 0 else {})}
+            for i, class_id in zip(ids, classify_by_diagonal(boxes), strict=True)
+        ]
+        labels = ["cluster"] * len(boxes)
+        self.markers.publish(
+            header, lambda previous: make_marker_rows(boxes, labels, ids=ids, extras=texts, previous=previous)
+        )
 
 
 class Obstacles:
@@ -103,20 +95,6 @@ class Obstacles:
             )
 
 
-class DetectionMarkers:
-    """Publisher of detections as markers."""
-
-    def __init__(self, node: LidarNode, topic: str):
-        self.node, self.publisher = node, node.outputs.advertise(topic, MARKERS)
-        self.marker_keys: Any = ()
-
-    def publish(self, header: Any, detections: Detections, clusters: np.ndarray | None = None) -> None:
-        """Publish detections that are in the frame of the header."""
-        rows = make_detection_rows(detections, self.marker_keys, clusters)
-        self.marker_keys = list_marker_keys(rows)
-        self.publisher.publish(MarkerRows(rows, header, find_marker_lifetime_ns(self.node)))
-
-
 class DetectionOutputs:
     """Publishers of detections, step times and, with tracking.enabled, tracks.
 
@@ -125,7 +103,7 @@ class DetectionOutputs:
 
     def __init__(self, node: LidarNode, steps: tuple[str, ...]):
         self.node = node
-        self.markers = DetectionMarkers(node, "detections")
+        self.markers = MarkerOutput(node, "detections")
         self.detections_3d = None
         if has_detections_3d():
             self.detections_3d = node.create_publisher(
@@ -143,7 +121,7 @@ class DetectionOutputs:
         ms: Mapping[str, float],
         xyz: np.ndarray,
         *,
-        tracked: Detections | None = None,
+        tracker_input: Detections | None = None,
         clusters: np.ndarray | None = None,
     ) -> str | None:
         """Publish detections that are in the level frame, and their tracks in the cloud's frame.
@@ -153,17 +131,17 @@ class DetectionOutputs:
             detections: detections above the thresholds.
             ms: {step: its time in ms}.
             xyz: (N, 3) points in the level frame, for the tracker.
-            tracked: detections to track, including those below the thresholds; by default
+            tracker_input: detections to track, including those below the thresholds; by default
                 `detections`.
             clusters: (K,) cluster_id of each detection.
 
         Returns:
             The problem of the tracker with its remedy, or None.
         """
-        cloud_header, tracked = header, detections if tracked is None else tracked
+        cloud_header, tracker_input = header, detections if tracker_input is None else tracker_input
         header, boxes = to_output_frame(self.node, header, detections.boxes)
         detections = replace(detections, boxes=boxes)
-        self.markers.publish(header, detections, clusters)
+        self.markers.publish(header, lambda previous: make_detection_rows(detections, previous, clusters))
         if self.detections_3d is not None and self.detections_3d.get_subscription_count():
             self.detections_3d.publish(
                 encode_detection_array(detections.boxes, detections.labels, detections.scores, header=header)
@@ -175,8 +153,9 @@ class DetectionOutputs:
             return None
         placement = self.node.transforms.find_placement(cloud_header)
         if placement.level is not None:
-            tracked = replace(tracked, boxes=transform_boxes(tracked.boxes, invert_pose(placement.level)))
-        return self.tracks.publish(cloud_header, tracked, placement.to_cloud_frame(xyz))
+            boxes = transform_boxes(tracker_input.boxes, invert_pose(placement.level))
+            tracker_input = replace(tracker_input, boxes=boxes)
+        return self.tracks.publish(cloud_header, tracker_input, placement.to_cloud_frame(xyz))
 
 
 class CandidateOutputs:
@@ -184,7 +163,7 @@ class CandidateOutputs:
 
     def __init__(self, node: LidarNode, steps: tuple[str, ...] = ("height", "stm", "cpa")):
         self.node = node
-        self.stages = {stage: DetectionMarkers(node, f"~/debug/{stage}") for stage in ("stage1", "stage2")}
+        self.stages = {stage: MarkerOutput(node, f"~/debug/{stage}") for stage in ("stage1", "stage2")}
         self.final = DetectionOutputs(node, steps)
 
     def publish(
@@ -205,9 +184,9 @@ class CandidateOutputs:
             candidates, problem = Candidates.none(), problem or str(error)
         for stage, markers in self.stages.items():
             if markers.publisher.get_subscription_count():
-                detections = getattr(candidates, stage)
-                output_header, boxes = to_output_frame(self.node, header, detections.boxes)
-                markers.publish(output_header, replace(detections, boxes=boxes))
+                output_header, boxes = to_output_frame(self.node, header, getattr(candidates, stage).boxes)
+                detections = replace(getattr(candidates, stage), boxes=boxes)
+                markers.publish(output_header, partial(make_detection_rows, detections))
         tracking_problem = self.final.publish(
             header, candidates.final, candidates.ms, xyz, clusters=candidates.clusters
         )

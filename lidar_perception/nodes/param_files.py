@@ -36,26 +36,31 @@ def read_sections(path: str | Path) -> dict[str, dict[str, Any]]:
         raise InputError(f"cannot read the parameter file {path}: {shorten_error(error)}") from None
     if not isinstance(content, dict):
         raise InputError(f"{path} is not a ROS parameter file; see config/ for examples")
-    visited = count()
+    entry_counter = count()
     sections: dict[str, dict[str, Any]] = {}
-    for node, group in _iterate_leaves(path, content, visited, "/", stop="ros__parameters"):
+    for node, group in _iterate_leaves(path, content, entry_counter, "/", stop="ros__parameters"):
         values = group if isinstance(group, dict) else {}
-        leaves = dict(_iterate_leaves(path, values, visited, "."))
+        leaves = dict(_iterate_leaves(path, values, entry_counter, "."))
         sections[node] = {**sections.get(node, {}), **leaves}
     return sections
 
 
 def _iterate_leaves(
-    path: str | Path, group: dict, visited: Iterator[int], separator: str, prefix: str = "", stop: str | None = None
+    path: str | Path,
+    group: dict,
+    entry_counter: Iterator[int],
+    separator: str,
+    prefix: str = "",
+    stop: str | None = None,
 ) -> Iterator[tuple[str, Any]]:
     """Yield (joined name, value) of each leaf, or of each key `stop`."""
     for key, value in group.items():
-        if next(visited) >= MAX_KEYS:
+        if next(entry_counter) >= MAX_KEYS:
             raise InputError(f"{path} has more than {MAX_KEYS} entries")
         if key == stop:
             yield prefix.removesuffix(separator), value
         elif isinstance(value, dict):
-            yield from _iterate_leaves(path, value, visited, separator, f"{prefix}{key}{separator}", stop)
+            yield from _iterate_leaves(path, value, entry_counter, separator, f"{prefix}{key}{separator}", stop)
         elif stop is None:
             yield f"{prefix}{key}", value
 

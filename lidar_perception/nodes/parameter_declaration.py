@@ -34,7 +34,7 @@ def declare_parameters(node: Node, params: Any) -> Any:
     Raises:
         ValueError: a value is out of range.
     """
-    declared, overrides = {}, get_parameter_overrides(node)
+    values, overrides = {}, get_parameter_overrides(node)
     for name, f in collect_fields(params).items():
         kind = _find_type(f)
         value = list(f.default) if isinstance(f.default, tuple) else f.default
@@ -44,11 +44,11 @@ def declare_parameters(node: Node, params: Any) -> Any:
                 value = []
             else:
                 overrides[name] = override
-        declared[name] = node.declare_parameter(name, kind if value == [] else value, _make_descriptor(f, kind)).value
-        if declared[name] is None:
+        values[name] = node.declare_parameter(name, kind if value == [] else value, _make_descriptor(f, kind)).value
+        if values[name] is None:
             store_empty_list(node, name, kind)
-            declared[name] = []
-    return with_values(params, declared)
+            values[name] = []
+    return with_values(params, values)
 
 
 def convert_to_declared_type(parameter: Parameter, kind: Parameter.Type) -> Parameter:
@@ -67,13 +67,13 @@ def _find_type(f: Any) -> Parameter.Type:
 
 
 def _make_descriptor(f: Any, kind: Parameter.Type) -> ParameterDescriptor:
-    limits = f.metadata
-    unit = f" [{limits['unit']}]" if limits["unit"] else ""
-    choices = f"one of {', '.join(limits['choices'])}" if limits["choices"] else ""
+    metadata = f.metadata
+    unit = f" [{metadata['unit']}]" if metadata["unit"] else ""
+    choices = f"one of {', '.join(metadata['choices'])}" if metadata["choices"] else ""
     descriptor = ParameterDescriptor(
-        description=limits["doc"] + unit, read_only=limits["fixed"], type=kind.value, additional_constraints=choices
+        description=metadata["doc"] + unit, read_only=metadata["fixed"], type=kind.value, additional_constraints=choices
     )
-    low, high = limits["low"], limits["high"]
+    low, high = metadata["low"], metadata["high"]
     if low is not None or high is not None:
         if kind == Parameter.Type.DOUBLE:
             descriptor.floating_point_range = [

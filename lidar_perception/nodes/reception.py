@@ -80,13 +80,13 @@ class Reception:
         )
         self.reliability = BEST_EFFORT if params().reliability == "best_effort" else RELIABLE
         self.waiting: deque[Any] = deque()
-        self.linked: deque[tuple[Any, dict]] = deque()  # messages received through a link, see _receive
+        self.linked_messages: deque[tuple[Any, dict]] = deque()  # (message, info) from a link, see _receive
         self.deliver_trigger = node.create_guard_condition(self._deliver_one)
         self.adapt_trigger = node.create_guard_condition(self.adapt)
         self.link_trigger = node.create_guard_condition(self._take_linked)
         self.last_time: float | None = None  # monotonic time of the last cloud
-        self.needs: str | None = None  # data that the oldest waiting cloud, or the last cloud, still needs
-        self.needed_since: float | None = None  # monotonic time at which that need arose
+        self.missing_input: str | None = None  # data that the oldest waiting cloud, or the last cloud, still needs
+        self.missing_since: float | None = None  # monotonic time since which clouds lack that data
         self.waiting_since: float | None = None  # monotonic time of arrival of the oldest waiting cloud
         self.output: Output | None = None  # in-process source of the topic, used instead of a subscription
         self.subscription: Any = None
@@ -110,7 +110,7 @@ class Reception:
             self.links.unwatch(self.topic, self._on_link_change)
         self._disconnect()
         self.last_time = None
-        self.needs = self.needed_since = self.waiting_since = None
+        self.missing_input = self.missing_since = self.waiting_since = None
         self.arrivals.record_interruption(len(self.waiting))
         self.waiting.clear()
 
@@ -120,14 +120,14 @@ class Reception:
         if self.output is None or self.links is None:
             self._subscribe()
         else:
-            self.linked = deque(maxlen=max(DEPTH, self.params().queue))
-            self.arrivals.depth = self.linked.maxlen or DEPTH
+            self.arrivals.depth = max(DEPTH, self.params().queue)
+            self.linked_messages = deque(maxlen=self.arrivals.depth)
             self.links.connect(self.output, self._receive)
 
     def _disconnect(self) -> None:
         if self.output is not None and self.links is not None:
             self.links.disconnect(self.output, self._receive)
-            self.linked.clear()
+            self.linked_messages.clear()
         if self.subscription is not None:
             self.node.destroy_subscription(self.subscription)
         self.output = self.subscription = None
@@ -195,14 +195,14 @@ class Reception:
 
     def _receive(self, message: Any, info: dict) -> None:
         """Queue a message of a link; called in the thread of its publisher."""
-        self.linked.append((message, info))
+        self.linked_messages.append((message, info))
         _trigger(self.link_trigger)
 
     def _on_link_change(self) -> None:
         _trigger(self.adapt_trigger)
 
     def _take_linked(self) -> None:
-        if messages := [self.linked.popleft() for _ in range(len(self.linked))]:
+        if messages := [self.linked_messages.popleft() for _ in range(len(self.linked_messages))]:
             self._accept(messages, one_publisher=True)
 
     def _accept(self, messages: list[tuple[Any, dict]], one_publisher: bool) -> None:
@@ -211,26 +211,26 @@ class Reception:
         # Newer clouds do not replace one that has waited for its pose only briefly. Otherwise no
         # cloud would ever be processed if poses arrive later than the next cloud.
         is_held = self.waiting_since is not None and monotonic() - self.waiting_since < MAX_HOLD_S
-        oldest = [self.waiting.popleft()] if is_held else []
+        held_clouds = [self.waiting.popleft()] if is_held else []
         dropped = max(0, len(self.waiting) - self.params().queue)
         for _ in range(dropped):
             self.waiting.popleft()
             self.waiting_since = self.waiting_since if is_held else None
-        self.waiting.extendleft(oldest)
+        self.waiting.extendleft(held_clouds)
         self.arrivals.add([info for _, info in messages], dropped, one_publisher)
         self._deliver_one()
 
     def _deliver_one(self) -> None:
         if not self.waiting:
             return
-        since = self.needed_since
+        since = self.missing_since
         may_wait = since is None or self._may_wait(monotonic() - since)
-        self.needs = self.deliver(self.waiting[0], may_wait)
+        self.missing_input = self.deliver(self.waiting[0], may_wait)
         self.last_time = monotonic()  # set after the work, so that processing time does not count as silence
-        self.needed_since = None if self.needs is None else since or self.last_time
-        if since and self.needs is None:
+        self.missing_since = None if self.missing_input is None else since or self.last_time
+        if since and self.missing_input is None:
             self.arrivals.reset_window()
-        if self.needs is not None and may_wait:
+        if self.missing_input is not None and may_wait:
             self.waiting_since = self.waiting_since or self.last_time
             return
         self.waiting.popleft()
@@ -251,7 +251,7 @@ class Reception:
 
     def retry(self) -> None:
         """Deliver the waiting cloud again: its input may have arrived, or its wait may be over."""
-        if self.waiting and self.needs is not None:
+        if self.waiting and self.missing_input is not None:
             self.deliver_trigger.trigger()
 
     def values(self) -> dict[str, Any]:
@@ -269,7 +269,7 @@ class Reception:
 
     def get_expected_rate(self) -> float | None:
         """Return the expected rate in Hz: input.rate, or the rate of the first clouds; None before that."""
-        return self.params().rate or self.arrivals.learned
+        return self.params().rate or self.arrivals.expected_rate
 
     def problems(self) -> list[Problem]:
         """Return the present problems of the topic with their remedies."""
@@ -289,8 +289,9 @@ class Reception:
             )
         if problem := self._find_incompatible_publisher(publishers):
             problems.append(problem)
-        if self.waiting and self.needs is not None:
-            return [*problems, ("waiting", WARN, f"the {self.what} on {self.topic} waits for {self.needs}")]
+        if self.waiting and self.missing_input is not None:
+            message = f"the {self.what} on {self.topic} waits for {self.missing_input}"
+            return [*problems, ("waiting", WARN, message)]
         if silence := self._find_silence():
             return [*problems, silence]
         expected, rate = self.get_expected_rate(), self.arrivals.measure_rate()

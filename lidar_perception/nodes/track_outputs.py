@@ -1,4 +1,4 @@
-"""Tracking of detections and publishing of tracks, for the tracker and the detector nodes."""
+"""Tracking of detections and publication of tracks, for the tracker and the detector nodes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.nodes.ego import EgoInput
-from lidar_perception.nodes.interfaces import MARKERS, RELIABLE
+from lidar_perception.nodes.interfaces import DETECTIONS_3D, MARKERS, RELIABLE
 from lidar_perception.nodes.runtime import LidarNode
 from lidar_perception.params import DetectionNodeParams, TrackerNodeParams
 from lidar_perception.runs.compiling import lock_compilation
@@ -21,14 +21,27 @@ from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import Detections
 from lidar_perception.wire.array_codec import encode_detection_array
 from lidar_perception.wire.track_markers import make_track_rows
-from msg_utils.markers import MarkerRows, list_marker_keys
+from msg_utils.markers import MarkerRow, MarkerRows, list_marker_keys
 from msg_utils.messages import load_message_class
 from msg_utils.stamps import SECOND_NS, to_ns
 
-DETECTIONS_3D = "vision_msgs/msg/Detection3DArray"
 MIN_LIFETIME_PERIODS = 2.5  # minimum lifetime of markers, in periods of the input
 MAX_LIFETIME_S = 1e6  # upper limit of that minimum; a Duration message has 32-bit seconds
 RATE_WINDOW_S = 10.0  # averaging window for the rates of new and ended tracks
+
+
+class MarkerOutput:
+    """Publisher of markers. Each array deletes those markers of the previous one that it does not contain."""
+
+    def __init__(self, node: LidarNode, topic: str):
+        self.node, self.publisher = node, node.outputs.advertise(topic, MARKERS)
+        self.keys: frozenset[tuple[str, int]] = frozenset()  # keys of the markers in the last array
+
+    def publish(self, header: Any, make_rows: Callable[[frozenset[tuple[str, int]]], list[MarkerRow]]) -> None:
+        """Publish the markers that make_rows(keys of the previous array) returns."""
+        rows = make_rows(self.keys)
+        self.keys = list_marker_keys(rows)
+        self.publisher.publish(MarkerRows(rows, header, find_marker_lifetime_ns(self.node)))
 
 
 class TrackOutputs:
@@ -46,11 +59,11 @@ class TrackOutputs:
             warm_up()
         self.tracker = Tracker(params().tracking)
         self.ego = EgoInput(node, lambda: params().ego, clouds)
-        self.pose_source = NO_SOURCE, True, 0  # pose source of the last frame
+        # Source, is_mounting_known and icp_restarts of the poses for the last frame.
+        self.pose_source = NO_SOURCE, True, 0
         self.trails = Trails()
         self.frame_id: str | None = None
-        self.marker_keys: Any = ()
-        self.markers = node.outputs.advertise("tracks", MARKERS)
+        self.markers = MarkerOutput(node, "tracks")
         self.array = (
             node.create_publisher(load_message_class(DETECTIONS_3D), "~/output/tracks_3d", RELIABLE)
             if has_detections_3d()
@@ -96,19 +109,14 @@ class TrackOutputs:
         )
 
     def _send(self, header: Any, stamp: int, tracks: Tracks) -> None:
-        output = self.node.node_params.output
-        trails = self.trails(tracks, self.tracker.pose, stamp, output.trail)
-        rows = make_track_rows(
-            tracks.ids,
-            tracks.detections,
-            tracks.velocities,
-            tracks.moving,
-            trails,
-            previous=self.marker_keys,
-            extras=[{"seen": bool(seen), "age": round(float(age), 3)} for seen, age in zip(tracks.seen, tracks.ages)],
+        trails = self.trails(tracks, self.tracker.pose, stamp, self.node.node_params.output.trail)
+        texts = [{"seen": bool(seen), "age": round(float(age), 3)} for seen, age in zip(tracks.seen, tracks.ages)]
+        self.markers.publish(
+            header,
+            lambda previous: make_track_rows(
+                tracks.ids, tracks.detections, tracks.velocities, tracks.moving, trails, previous=previous, extras=texts
+            ),
         )
-        self.marker_keys = list_marker_keys(rows)
-        self.markers.publish(MarkerRows(rows, header, find_marker_lifetime_ns(self.node)))
         if self.array is not None and self.array.get_subscription_count():
             detections = tracks.detections
             self.array.publish(

@@ -6,9 +6,9 @@ from typing import Any
 
 from lidar_perception.classes import DETECTED
 from lidar_perception.nodes.diagnostics import OK, WARN
-from lidar_perception.nodes.interfaces import MARKERS
+from lidar_perception.nodes.interfaces import DETECTIONS_3D, MARKERS
 from lidar_perception.nodes.managed import ManagedNode
-from lidar_perception.nodes.track_outputs import DETECTIONS_3D, TrackOutputs, has_detections_3d
+from lidar_perception.nodes.track_outputs import TrackOutputs, has_detections_3d
 from lidar_perception.params import TrackerExtraParams, TrackerNodeParams
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import find_unknown_classes, to_detections

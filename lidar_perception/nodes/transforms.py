@@ -56,20 +56,20 @@ class Transforms:
         self.odometry_child = self.odometry_frame = ""  # child frame and parent frame of the odometry
         self.odometry_ns: int | None = None  # stamp of the last odometry message
         self.odometry_arrival = self.ignored_arrival = -inf  # monotonic times of arrival
-        # Functions that return what a cloud with this header still needs, or None.
-        self.more_needs: list[Callable[[Any], str | None]] = []
-        self.sweep: float | None = None  # time from the stamp to the last point of a cloud, in seconds
+        # Functions that describe the data that a cloud with this header still needs, or return None.
+        self.other_checks: list[Callable[[Any], str | None]] = []
+        self.sweep_duration: float | None = None  # time from the stamp to the last point of a cloud, in seconds
         self.problem_by_source: dict[str, str] = {}  # parameter that causes the problem -> message
         self.diagnostic_values: dict[str, Any] = {}
         self._cached_placement: tuple[tuple[str, int], Placement] = (("", -1), Placement(""))
         self._connected_pairs: set[tuple[str, str]] = set()  # pairs of frames that TF has connected before
         self._has_tf_subscription = self._has_odometry_subscription = False
-        self._installed = has_tf()
-        if self._installed:
+        self._has_tf = has_tf()
+        if self._has_tf:
             self._subscribe(TF_STATIC, STATIC_QOS, static=True)
         if self.base_frame or self.target_frame or params.input.deskew == "tf":
             self.subscribe_to_tf()
-            if not self._installed:
+            if not self._has_tf:
                 self.problem_by_source["TF"] = NO_TF
         if params.input.deskew == "odometry":
             self.subscribe_to_odometry()
@@ -84,7 +84,7 @@ class Transforms:
         if self._has_tf_subscription:
             return
         self._has_tf_subscription = True
-        if self._installed:
+        if self._has_tf:
             self._subscribe(TF, TF_QOS, static=False)
 
     def subscribe_to_odometry(self) -> None:
@@ -135,7 +135,7 @@ class Transforms:
     def find_missing_input(self, cloud: Any) -> str | None:
         """Return a description of the data that a cloud should wait for, or None."""
         return self._find_missing_frame(cloud) or next(
-            filter(None, (need(cloud.header) for need in self.more_needs)), None
+            filter(None, (find_missing(cloud.header) for find_missing in self.other_checks)), None
         )
 
     def _find_missing_frame(self, cloud: Any) -> str | None:
@@ -170,13 +170,13 @@ class Transforms:
 
         Uses the duration of the last deskewed cloud; until a cloud has been deskewed, the duration of this one.
         """
-        if self.sweep is None:
+        if self.sweep_duration is None:
             try:
                 seconds = read_point_times(cloud, to_point_cloud(cloud)[1]).seconds
             except InputError:  # reported by deskew_cloud()
                 return 0.0
-            self.sweep = float(seconds[np.isfinite(seconds)].max(initial=0.0))
-        return self.sweep
+            self.sweep_duration = float(seconds[np.isfinite(seconds)].max(initial=0.0))
+        return self.sweep_duration
 
     def find_placement(self, header: Any) -> Placement:
         """Return the placement of a cloud with this header."""
@@ -195,22 +195,19 @@ class Transforms:
                 "the ground (like base_footprint); using ground.sensor_pose"
             )
             base = None
-        ahead = np.radians(self.node.node_params.input.ahead)
+        forward_yaw = np.radians(self.node.node_params.input.ahead)
         sensor_pose = base
-        if sensor_pose is None and ahead:  # the yaw rotation comes after levelling, so both are applied here
+        if sensor_pose is None and forward_yaw:  # the yaw rotation follows levelling, so both are applied here
             sensor_pose = self._make_configured_pose()
             sensor_pose = np.eye(4) if sensor_pose is None else sensor_pose
-        level = None if sensor_pose is None else find_level_transform(sensor_pose, ahead)
+        level = None if sensor_pose is None else find_level_transform(sensor_pose, forward_yaw)
         target = self._look_up("target_frame", self.target_frame, frame_id, stamp_ns)
         if target is None:
             return Placement(frame_id, base, level, None if level is None else invert_pose(level))
         return Placement(self.target_frame, base, level, target if level is None else target @ invert_pose(level))
 
     def _look_up(self, parameter: str, frame: str, frame_id: str, stamp_ns: int) -> np.ndarray | None:
-        """Return the pose of frame_id in `frame`, the value of this parameter; None if it is unknown.
-
-        A missing transform is reported by problems().
-        """
+        """Return the pose of frame_id in `frame`, the value of this parameter; None, with a problem, if unknown."""
         self.problem_by_source.pop(parameter, None)
         if not frame:
             return None
@@ -246,8 +243,8 @@ class Transforms:
                 crop = replace(crop, body=())
             elif crop.body[5] <= 0.0:
                 self.problem_by_source["crop.body"] = (
-                    f"the top of crop.body is {-crop.body[5]:.2f} m below '{self.base_frame}'"
-                    "; specify the box in that frame, as `setup` does in its parameter file"
+                    f"the top of crop.body is {-crop.body[5]:.2f} m below '{self.base_frame}'; specify the box in "
+                    "that frame, as `setup` does in its parameter file"
                 )
         level = placement.level
         pose = None if placement.base is not None else self._make_configured_pose()
@@ -354,14 +351,14 @@ class Transforms:
         begin, counts = perf_counter(), self.node.diagnostics.counts
         self.problem_by_source.pop("deskew", None)
         try:
-            deskewed = self._deskew_points(msg)
+            deskewed_cloud = self._deskew_points(msg)
         except InputError as error:
             self.problem_by_source["deskew"] = f"input.deskew: {error}; clouds are not deskewed"
             counts["not_deskewed"] = counts.get("not_deskewed", 0) + 1
             return msg
         counts["deskewed"] = counts.get("deskewed", 0) + 1
         self.diagnostic_values["deskew_ms"] = f"{(perf_counter() - begin) * 1e3:.1f}"
-        return deskewed
+        return deskewed_cloud
 
     def _deskew_points(self, msg: Any) -> Any:
         frame, indices = to_point_cloud(msg)
@@ -372,7 +369,7 @@ class Transforms:
 
         def look_up_poses(at: np.ndarray) -> np.ndarray:
             # Set before the lookup: after a failure, the next cloud waits for the end of its sweep.
-            self.sweep = float(at.max() - frame.stamp_ns) / SECOND_NS
+            self.sweep_duration = float(at.max() - frame.stamp_ns) / SECOND_NS
             return self.look_up_sensor_poses(self.node.node_params.input.deskew, frame.frame_id, at)
 
         result = deskew_points(msg, frame, indices, look_up_poses)

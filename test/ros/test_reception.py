@@ -195,7 +195,7 @@ def test_every_cloud_is_processed_or_counted_as_dropped():
         assert arrivals.sent == number - first == taken + arrivals.dropped + arrivals.lost
         sent, lost, dropped = arrivals.count_recent()
         assert 0 <= lost + dropped < sent and sent >= WINDOW
-        assert arrivals.learned == arrivals.measure_rate() == pytest.approx(10)
+        assert arrivals.expected_rate == arrivals.measure_rate() == pytest.approx(10)
 
 
 def test_cloud_dropped_from_full_queue_is_not_counted_lost():
@@ -224,7 +224,7 @@ def test_lower_rate_of_a_sensor_is_measured_from_its_stamps():
     for info in infos(range(30, 30 + RATE_INTERVALS)):
         info["source_timestamp"] = 29 * 10**8 + (info["publication_sequence_number"] - 29) * 10**9
         arrivals.add([info], 0)
-    assert arrivals.learned == pytest.approx(10) and arrivals.measure_rate() == pytest.approx(1)
+    assert arrivals.expected_rate == pytest.approx(10) and arrivals.measure_rate() == pytest.approx(1)
 
 
 OVERRIDE = f"qos_overrides./{NODE}/input/points.subscription.reliability"
@@ -373,7 +373,7 @@ class Late:
 )
 def test_slow_sensor_is_not_reported_as_silent(monkeypatch, given, learned, error, stale, lifetime):
     late = Late(monkeypatch, lambda stamp: 0.0, rate=given)
-    late.reception.arrivals.learned, late.reception.last_time = learned, 1.0
+    late.reception.arrivals.expected_rate, late.reception.last_time = learned, 1.0
     for late.now, kinds in (
         (1 + error, []),
         (1.1 + error, ["silent"]),

@@ -108,7 +108,7 @@ def replay(
             **({} if real_time else {"ego.max_wait": SILENCE_TIMEOUT_S}),
         },
     )
-    if scored := detector == "candidates":
+    if has_scores := detector == "candidates":
         nodes["evaluator"] = configure_evaluator(scores.resolve(), single)
     recorded_topics = [find_result_cloud_topic(single, detector), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
     nodes["bag_recorder"] = {}, {"bag": str((out / "result").resolve()), "topics": recorded_topics}
@@ -117,12 +117,12 @@ def replay(
         with node_processes.share_process(GRAPH) if one_process else nullcontext():
             for node in (*graph, "bag_recorder"):
                 node_processes.start(node, *nodes[node])
-        if scored:
+        if has_scores:
             node_processes.start("evaluator", *nodes["evaluator"])
         outputs = find_connected_outputs({node: remap for node, (remap, _) in nodes.items()})
         with errors.status("starting the nodes"):
-            ready = monitor.spin_until(lambda: monitor.is_connected(outputs), START_TIMEOUT_S, node_processes.check)
-        if not ready:
+            is_ready = monitor.spin_until(lambda: monitor.is_connected(outputs), START_TIMEOUT_S, node_processes.check)
+        if not is_ready:
             raise InputError(
                 f"the nodes have not connected within {START_TIMEOUT_S:.0f} s (started: "
                 f"{', '.join(monitor.diagnostics) or 'none'}); see {out}/logs"
@@ -130,9 +130,9 @@ def replay(
         # Besides the graph, the tracker and the recorder may subscribe to the clouds; the recorder
         # also subscribes to the labels.
         cloud_subscribers = 1 + (poses == "kiss_icp") + (POINTS in recorded_topics)
-        rules = list_awaited_topics([detector], single, cloud_subscribers, 1 + scored)
+        rules = list_awaited_topics([detector], single, cloud_subscribers, 1 + has_scores)
         # The detections have four subscribers: monitor, recorder, tracker, evaluator.
-        rules += [f"{make_relative(stages[FINAL_STAGE])}:={3 + scored}"]
+        rules += [f"{make_relative(stages[FINAL_STAGE])}:={3 + has_scores}"]
         rules += [make_relative(ODOMETRY)] if poses == "recording" else []
         first, last = CpuTimes(), CpuTimes()  # CPU times at the first and the last result
         node_processes.start(
@@ -167,7 +167,7 @@ def replay(
                 previous_frames = monitor.frames
                 monitor.spin_until(is_finished, SILENCE_TIMEOUT_S, lambda: node_processes.check("bag_player"))
 
-        # Both timings lag behind the results by their own processing time.
+        # The tracker and the evaluator lag behind the detections by their own processing time.
         def has_caught_up(node: str) -> bool:
             return int(monitor.get_value(node, "frames") or 0) >= monitor.frames
 
@@ -175,12 +175,12 @@ def replay(
             monitor.spin_until(partial(has_caught_up, node), SILENCE_TIMEOUT_S)
         stage_ms = {node: float(ms) for node in graph if (ms := monitor.get_value(node, "processing_ms_median"))}
         codes = node_processes.stop(timeout=30)
-    if failed := {node: code for node, code in codes.items() if code}:
-        errors.print(Text(f"nodes failed with exit codes {failed}", "red") + f"; see {out}/logs")
+    if failures := [f"{node} (exit code {code})" for node, code in codes.items() if code]:
+        errors.print(Text(f"nodes failed: {', '.join(failures)}", "red") + f"; see {out}/logs")
     if monitor.frames == 0:
         raise InputError(f"{drive}: no cloud produced a result; see {out}/logs")
     return {
-        **(json.loads(scores.read_text()) if scored else {}),
+        **(json.loads(scores.read_text()) if has_scores else {}),
         "clouds": clouds,
         "results": monitor.frames,
         "latency_ms": {
