@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import cos, sin
 
@@ -18,6 +18,7 @@ from lidar_perception.simulation.trajectory import Trajectory
 HEAD_ROOM_M = 2.2  # height above which parts do not block other actors
 # Maximum distance of objects in a scan, and of those that are larger than LARGE_M.
 SIGHT_M, FAR_SIGHT_M, LARGE_M = 80.0, 120.0, 5.0
+SLIDE_STEP_M = 0.05  # step of the search for a place next to another actor
 STEP_S = 0.1  # time step of the robot's trajectory in collision checks
 
 
@@ -205,6 +206,30 @@ class ActorSet:
         """Add each actor that never comes within `gap` of the others or the robot."""
         for actor in actors:
             self.admit(actor, gap=gap)
+
+    def admit_next_to_other(self, actor: Actor, direction: float, distance: float, gap: float) -> bool:
+        """Move an actor in a direction until it is next to another actor, and add it there.
+
+        Args:
+            actor: The actor, which stands still.
+            direction: Direction in the world, rad.
+            distance: Maximum distance, m.
+            gap: Gap to the other actor, m.
+
+        Returns:
+            False if the actor was not added: its place is taken, or no other actor is within the distance.
+        """
+        footprint = actor.footprint.copy()
+        step = SLIDE_STEP_M * np.array([cos(direction), sin(direction)])
+        others, radii = self._footprints[: self._count], self._radii
+        for moved in range(1 + int(distance / SLIDE_STEP_M)):
+            if _touches_trajectory(footprint, self._path, self._radius + gap):
+                return False
+            if _touches_any(footprint, others, radii, self.seconds, 0.0):
+                x, y = footprint[:2] - step * (1 + gap / SLIDE_STEP_M) - actor.footprint[:2]
+                return moved > 0 and self.admit(replace(actor, x=actor.x + x, y=actor.y + y), gap=0.0)
+            footprint[:2] += step
+        return False
 
     def add(self, *group: Actor) -> None:
         """Add a group that may touch others, such as people on a bench."""

@@ -10,7 +10,7 @@ import numpy as np
 from lidar_perception.simulation import crowd
 from lidar_perception.simulation.actors import Actor, ActorSet, make_prop
 from lidar_perception.simulation.places import Court, Side, draw_even_positions, draw_positions_along, place_along
-from lidar_perception.simulation.roadside import FRONTS, is_plant, make_clutter
+from lidar_perception.simulation.roadside import CLUTTER, FRONTS, is_plant, make_clutter
 from lidar_perception.simulation.shapes import furniture, vegetation
 from lidar_perception.simulation.shapes.buildings import make_glass_hall
 from lidar_perception.simulation.shapes.cyclists import make_bicycle, make_cyclist
@@ -224,7 +224,7 @@ def _furnish_edge(rng, side: Side, kind: CampusKind, has_curb: bool) -> Iterator
             for position in draw_even_positions(rng, side.length, rng.uniform(7, 20)):
                 yield side.place(make(rng), position, offset + rng.normal(0, 0.1), -np.pi / 2)
     if not kind.is_path:
-        yield from place_along(rng, side, (*furniture.PERSON_SIZED, furniture.make_pole), kind.edge_objects)
+        yield from place_along(rng, side, CLUTTER, kind.edge_objects)
         return
     for position in draw_positions_along(rng, side.length, kind.edge_objects):
         yield side.place(make_clutter(rng), position, rng.uniform(0.6, 1.2), rng.uniform(-np.pi, np.pi))

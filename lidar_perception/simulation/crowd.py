@@ -14,6 +14,10 @@ from lidar_perception.simulation.shapes.scene_object import SceneObject
 
 # Probabilities of groups with 1, 2, ... people.
 STANDING_PROBABILITIES, WALKING_PROBABILITIES = (0.55, 0.3, 0.1, 0.05), (0.62, 0.3, 0.08)
+AT_WALL_RATIO = 0.25  # fraction of groups that is replaced by people at walls
+AT_WALL_TRIES = 0.9  # tries to place a person at a wall of a court per replaced group
+MAX_AT_WALL_M = 4.0  # maximum distance of a wall from the edge of a court
+LEANING_RATIO = 0.35  # people at walls who lean against it
 CROWD_FACTORS = 0.3, 1.0, 1.0, 2.5  # random factors for the number of people in a court
 WHEELCHAIR_RATIO = 0.06  # wheelchairs per walking or standing group
 
@@ -42,6 +46,31 @@ def place_standing(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
             )
             for angle in angles
         ]
+
+
+def stand_at_walls(
+    rng, actors: ActorSet, side: Side, rate: float, offsets: tuple[float, float], distance: float, turn: float
+) -> None:
+    """Add people next to the objects along a line: walls, shop fronts, fences, hedges, shelves, parked vehicles.
+
+    Some lean against it. The others are up to 1 m away and look at it, away from it or along it.
+
+    Args:
+        rng: Random generator.
+        actors: Actors of the scene, to which people are added.
+        side: The line.
+        rate: Mean number of tries per 100 m.
+        offsets: Range of distances from the line at which the search begins, m.
+        distance: Maximum length of the search beyond the line, m.
+        turn: Direction of the search relative to the line, rad: pi / 2 for left, -pi / 2 for right.
+    """
+    for position in draw_positions_along(rng, side.length, rate):
+        offset, is_leaning = rng.uniform(*offsets), rng.random() < LEANING_RATIO
+        person = make_pedestrian(rng, 0.0, lean=rng.uniform(0.05, 0.25)) if is_leaning else make_person(rng)
+        heading = np.pi if is_leaning else rng.choice((np.pi, 0.0, np.pi / 2, -np.pi / 2), p=(0.4, 0.3, 0.15, 0.15))
+        actor = side.place(person, position, offset, turn + heading + rng.normal(0, 0.1 if is_leaning else 0.3))
+        gap = 0.0 if is_leaning else min(0.05 + rng.exponential(0.3), 1.0)
+        actors.admit_next_to_other(actor, side.heading + turn, distance + abs(offset), gap)
 
 
 def place_walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Actor]]:
@@ -121,6 +150,12 @@ def fill_court(
         standers: Groups who stand, per 100 m.
     """
     people *= rng.choice(CROWD_FACTORS)
+    floor, sides = court.floor, court.make_sides()
+    groups_at_walls = ((walkers + standers) + strollers * floor.sidewalk_width) * floor.length / 100
+    rate = AT_WALL_RATIO * AT_WALL_TRIES * groups_at_walls * people / sum(side.length for side in sides) * 100
+    for side, depth in zip(sides, (floor.sidewalk_width, floor.length) * 2):
+        stand_at_walls(rng, actors, side, rate, (-depth / 2, -0.3), MAX_AT_WALL_M, np.pi / 2)
+    people *= 1 - AT_WALL_RATIO
     for groups in (
         place_standing(rng, court.floor, standers * people),
         place_walking(rng, court.floor, walkers * people, roam=False),

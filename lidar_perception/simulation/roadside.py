@@ -18,6 +18,7 @@ BORDERS = (*[vegetation.make_hedge] * 3, *[furniture.make_fence] * 2, furniture.
 # (bushes per 100 m, trees per 100 m, depth of their strip in m) for a forest edge, a hedgerow and fields.
 WILD_FRONTS = ((110, 60, 4.0), (130, 12, 1.2), (8, 3, 15.0))
 RURAL_CLUTTER = (furniture.make_sign, furniture.make_beacon, furniture.make_bollard, furniture.make_pole)
+CLUTTER = (*furniture.PERSON_SIZED, furniture.make_pole, vegetation.make_shrub, vegetation.make_shrub)
 
 
 def furnish(rng: np.random.Generator, street: Street, actors: ActorSet) -> None:
@@ -37,7 +38,7 @@ def is_plant(actor: Actor) -> bool:
 
 def make_clutter(rng, is_rural: bool = False) -> np.ndarray:
     """Make a random roadside object that is as large as a person, or a pole, as (P,) PART."""
-    makers = RURAL_CLUTTER if is_rural else (*furniture.PERSON_SIZED, furniture.make_pole)
+    makers = RURAL_CLUTTER if is_rural else CLUTTER
     return makers[rng.integers(len(makers))](rng)
 
 

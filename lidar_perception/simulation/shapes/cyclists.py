@@ -30,7 +30,7 @@ class RiderBuild(NamedTuple):
         lean: Forward tilt of the trunk, rad.
         phase: Initial angle of the cranks, rad.
         frame, coat, trousers, head: Reflectances.
-        load: "", "basket" or "backpack".
+        load: "", "basket", "backpack" or "box".
     """
 
     size: tuple[float, float, float]
@@ -48,13 +48,13 @@ def make_cyclist(rng: np.random.Generator) -> SceneObject:
     size = draw_size(rng, CLASSES[CYCLIST])
     rider = RiderBuild(
         size,
-        rng.uniform(0.15, 0.6),
+        rng.uniform(0.0, 0.7),
         rng.uniform(0, 2 * pi),
         rng.uniform(0.1, 0.8),
         rng.uniform(0.2, 0.85),
         rng.uniform(0.15, 0.75),
         rng.uniform(0.15, 0.75),
-        ("", "basket", "backpack")[rng.integers(3)],
+        ("", "", "basket", "backpack", "box")[rng.integers(5)],
     )
     return SceneObject(partial(pose_rider, rider=rider), size, CLASSES[CYCLIST])
 
@@ -110,6 +110,8 @@ def pose_rider(travelled: float, rider: RiderBuild) -> np.ndarray:
         rows.append(
             block((bar_x + 0.05, -0.16, bar_z - 0.3), (bar_x + 0.33, 0.16, bar_z - 0.05), METAL, transmission=0.4)
         )
+    elif rider.load == "box":  # on the carrier
+        rows.append(block((-0.47 * length, -0.2, 0.4 * height), (hip[0] - 0.2, 0.2, 0.4 * height + 0.4), 0.3))
     elif rider.load == "backpack":
         x, z = point_on_trunk(0.18)
         rows.append(

@@ -29,6 +29,16 @@ def make_pole(rng: np.random.Generator) -> np.ndarray:
     return make_parts([_make_post(rng.uniform(2.5, 8.0), rng.uniform(0.04, 0.12))], POLE)
 
 
+def make_post(rng: np.random.Generator) -> np.ndarray:
+    """Make a thin post of 1.1 to 2.2 m, as at parking spaces, gates and plants; some with a small box or sign."""
+    height, radius = rng.uniform((1.1, 0.025), (2.2, 0.08))
+    rows = [_make_post(height, radius)]
+    if rng.random() < 0.5:
+        low, half_width = rng.uniform((0.5 * height, 0.06), (height - 0.3, 0.18))
+        rows.append(block((radius, -half_width, low), (radius + 0.1, half_width, low + 0.3), rng.uniform(0.1, 0.5)))
+    return make_parts(rows, POLE)
+
+
 def make_lamp(rng: np.random.Generator) -> np.ndarray:
     """Make a street lamp of 4 to 8 m: mast, base with a door, arm to +x, head."""
     height, arm = rng.uniform(4.0, 8.0), rng.uniform(0.4, 1.5)
@@ -331,6 +341,8 @@ def _make_upright_cylinder(low: float, height: float, radius: float, reflectance
 
 # Functions that make objects which a detector may confuse with a person.
 PERSON_SIZED = (
+    make_post,
+    make_post,
     make_sign,
     make_beacon,
     make_litter_bin,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from math import cos, hypot, pi, sin, sqrt
+from math import cos, hypot, pi, sin, sqrt, tan
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from lidar_perception.classes import CLASSES, PEDESTRIAN
 from lidar_perception.simulation.shapes.primitives import METAL, RUBBER, SKIN, block, box, disc, ellipsoid, rod
 from lidar_perception.simulation.shapes.scene_object import SceneObject, draw_size, make_rigid
-from lidar_perception.simulation.solids import compute_hull, make_parts
+from lidar_perception.simulation.solids import CYLINDER, ELLIPSOID, compute_hull, make_parts
 
 PERSON, OTHER = 30, 99
 CARRIED = ("", "backpack", "bag", "umbrella", "trolley", "pram")
@@ -36,6 +36,7 @@ class PersonBuild(NamedTuple):
         hair, coat, trousers: Reflectances.
         carried: One of CARRIED.
         shift: x of the hips, m.
+        lean: Backward tilt of a person who leans against a wall, rad.
     """
 
     height: float
@@ -47,9 +48,12 @@ class PersonBuild(NamedTuple):
     trousers: float
     carried: str = ""
     shift: float = 0.0
+    lean: float = 0.0
 
 
-def make_pedestrian(rng: np.random.Generator, speed: float, child: bool = False, carried: str = "") -> SceneObject:
+def make_pedestrian(
+    rng: np.random.Generator, speed: float, child: bool = False, carried: str = "", lean: float = 0.0
+) -> SceneObject:
     """Make a person who walks at a speed in m/s, or stands.
 
     The box encloses the body during a full stride, without a bag, umbrella, trolley or pram. Its
@@ -70,6 +74,7 @@ def make_pedestrian(rng: np.random.Generator, speed: float, child: bool = False,
         rng.uniform(0.2, 0.85),
         rng.uniform(0.15, 0.75),
         carried,
+        lean=lean,
     )
     low, high = _measure_stride(build)
     build = build._replace(shift=-(low + high) / 2)
@@ -82,7 +87,7 @@ def _measure_stride(build: PersonBuild) -> tuple[float, float]:
     body = build._replace(carried="backpack" if build.carried == "backpack" else "", phase=0.0)
     poses = [_make_limb_parts(i / 24, body) for i in range(12 if build.step else 1)]
     rows = [row for limbs, _ in poses for row in limbs] + _make_trunk_parts(body, 0.0)
-    low, _, _, high, _, _ = compute_hull(make_parts(rows, PERSON))
+    low, _, _, high, _, _ = compute_hull(_lean_back(make_parts(rows, PERSON), build.lean))
     return low, high
 
 
@@ -95,8 +100,20 @@ def pose_walker(travelled: float, build: PersonBuild) -> np.ndarray:
     strides = build.phase + (travelled / (2 * build.step) if build.step else 0.0)
     limbs, dz = _make_limb_parts(strides, build)
     trunk = _make_trunk_parts(build, dz)
-    parts = make_parts(trunk[:5] + limbs + trunk[5:], PERSON)
+    parts = _lean_back(make_parts(trunk[:5] + limbs + trunk[5:], PERSON), build.lean)
     parts["centre"][:, 0] += build.shift
+    return parts
+
+
+def _lean_back(parts: np.ndarray, angle: float) -> np.ndarray:
+    """Tilt the parts (P,) PART of a person backwards by an angle in rad, in place. The feet and all heights stay."""
+    if angle:
+        tangent, is_rod = tan(angle), parts["kind"] == CYLINDER
+        parts["centre"][:, 0] -= tangent * parts["centre"][:, 2]
+        yaw, pitch = parts["yaw"][is_rod], parts["pitch"][is_rod]
+        x, y, z = np.sin(pitch) * np.cos(yaw) - tangent * np.cos(pitch), np.sin(pitch) * np.sin(yaw), np.cos(pitch)
+        parts["yaw"][is_rod], parts["pitch"][is_rod] = np.arctan2(y, x), np.arctan2(np.hypot(x, y), z)
+        parts["pitch"][parts["kind"] == ELLIPSOID] -= angle
     return parts
 
 

@@ -86,6 +86,14 @@ def make_bush(rng: np.random.Generator) -> np.ndarray:
     return make_parts(rows, VEGETATION)
 
 
+def make_shrub(rng: np.random.Generator) -> np.ndarray:
+    """Make a clipped shrub or a short piece of hedge of a person's size, as (P,) PART."""
+    x, y, height = rng.uniform((0.2, 0.2, 0.8), (0.8, 0.4, 2.0))
+    half_size, density = (x, y, height / 2 + 0.1), rng.uniform(4.0, 10.0)
+    make = box if rng.random() < 0.4 else ellipsoid
+    return make_parts([make((0, 0, height / 2 - 0.1), half_size, LEAVES, density=density)], VEGETATION)
+
+
 def make_hedge(rng: np.random.Generator, length: float) -> np.ndarray:
     """Make a hedge as (P,) PART, centred along x, with an uneven top. It begins 0.3 m below the ground."""
     height, half_width = rng.uniform(0.8, 2.0), rng.uniform(0.25, 0.5)

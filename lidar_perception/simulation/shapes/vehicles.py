@@ -57,7 +57,8 @@ class Style(NamedTuple):
         rear_low: Lower end of the rear window.
         bonnet, belt: Heights of the bonnet and of the lower edge of the windows, as fractions of
             the height.
-        load: Front end of the closed load area of a panel van, 0 for none.
+        load: Front end of the closed load area of a panel van, or of the bed of a pick-up, 0 for none.
+        bed: Height of the floor of the bed of a pick-up as a fraction of the height, 0 for other bodies.
     """
 
     screen_low: float
@@ -67,6 +68,7 @@ class Style(NamedTuple):
     bonnet: float
     belt: float
     load: float = 0.0
+    bed: float = 0.0
 
 
 HATCHBACK = Style(0.74, 0.55, 0.12, 0.03, 0.60, 0.63)
@@ -75,12 +77,22 @@ ESTATE = Style(0.73, 0.55, 0.07, 0.03, 0.59, 0.63)
 SUV = Style(0.74, 0.58, 0.06, 0.02, 0.60, 0.62)
 MINIBUS = Style(0.85, 0.70, 0.03, 0.01, 0.52, 0.56)
 PANEL_VAN = Style(0.85, 0.70, 0.03, 0.01, 0.52, 0.56, 0.55)
+PICK_UP = Style(0.72, 0.60, 0.40, 0.38, 0.58, 0.60, 0.38, 0.40)
+# Limits of length, width and height in m of large cars and of pick-ups.
+LARGE_SIZE = (4.6, 1.78, 1.42), (5.4, 2.0, 1.9)
+PICK_UP_SIZE = (5.0, 1.8, 1.7), (5.9, 2.05, 1.98)
+LARGE_RATIO, PICK_UP_RATIO = 0.06, 0.06  # fractions of cars; not taken from data
 
 
 def make_car(rng: np.random.Generator, driver: bool = True) -> SceneObject:
     """Make a car of random size, body and paint."""
-    size = draw_size(rng, CLASSES[CAR_ID])
-    if size[2] > 1.62:
+    size, pick = draw_size(rng, CLASSES[CAR_ID]), rng.random()
+    if pick < LARGE_RATIO + PICK_UP_RATIO:
+        length, width, height = rng.uniform(*(PICK_UP_SIZE if pick < PICK_UP_RATIO else LARGE_SIZE))
+        size = float(length), float(width), float(height)
+    if pick < PICK_UP_RATIO:
+        style = PICK_UP
+    elif size[2] > 1.62:
         style = SUV
     elif size[0] > 4.2:
         style = (SEDAN, SEDAN, ESTATE)[rng.integers(3)]
@@ -141,8 +153,9 @@ def make_body(
     belt, bonnet = style.belt * height, style.bonnet * height
     screen_low_x, screen_high_x, roof_rear_x, rear_low_x = ((fraction - 0.5) * length for fraction in style[:4])
     load = (style.load - 0.5) * length if style.load else rear - radius
-    deck = height if style.load else TAIL_TOP * height
-    top, roof_half_width = height - ROOF_RISE_M, 0.86 * y if not style.load else 0.92 * y
+    deck = style.bed * height if style.bed else height if style.load else TAIL_TOP * height
+    is_van = style.load and not style.bed
+    top, roof_half_width = height - ROOF_RISE_M, 0.92 * y if is_van else 0.86 * y
     rows = [
         block((rear, -0.98 * y, clearance), (front, 0.98 * y, arch), colour),
         *_make_bonnet_parts((screen_low_x, bonnet), x, 0.97 * y, height, colour),
@@ -163,12 +176,18 @@ def make_body(
         ),
         slope((screen_low_x, bonnet), (screen_high_x, top), 0.9 * y, GLASS, transmission=glass),
     ]
-    if style.load:
+    if is_van:
         rows.append(block((0.02 - x, -0.95 * y, belt), (0.2 - x, 0.95 * y, top), colour))
     else:
-        rows.append(slope((roof_rear_x, top), (rear_low_x, deck), 0.88 * y, GLASS, transmission=glass))
+        window_foot = belt if style.bed else deck
+        rows.append(slope((roof_rear_x, top), (rear_low_x, window_foot), 0.88 * y, GLASS, transmission=glass))
+    if style.bed:  # the tailgate and the rear wall of the cab
+        rows += [
+            block((wall_x, -0.93 * y, deck - 0.1), (wall_x + 0.08, 0.93 * y, belt), colour)
+            for wall_x in (TAIL_GAP_M - x, rear_low_x)
+        ]
     for side in (-1, 1):
-        start, end = (load if style.load else (roof_rear_x + rear_low_x) / 2), (screen_low_x + screen_high_x) / 2
+        start, end = (load if is_van else (roof_rear_x + rear_low_x) / 2), (screen_low_x + screen_high_x) / 2
         rows += [
             block((0.15 - x, side * y, arch), (screen_low_x + 0.02, side * (y - 0.05), belt), colour),
             upright_pane(
@@ -184,7 +203,7 @@ def make_body(
             disc((-axle, side * (y - 0.1), radius), radius, 0.1, 0.2),
             ellipsoid((screen_low_x - 0.1, side * (y + 0.08), belt + 0.05), (0.07, 0.1, 0.08), colour),
         ]
-        if not style.load:
+        if not is_van:
             rows.append(
                 rod(
                     (max(rear_low_x, 0.06 - x), side * 0.9 * y, belt),
