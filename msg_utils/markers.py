@@ -162,9 +162,9 @@ def to_marker_array(
 def rows_to_message(rows: Iterable[MarkerRow], header: Any, make: Any, lifetime_ns: int = 0) -> Any:
     """Build a MarkerArray from rows."""
 
-    def make_vector(kind: str, numbers: Sequence[float]) -> Any:
+    def make_vector(type_name: str, numbers: Sequence[float]) -> Any:
         x, y, z = map(float, numbers)
-        return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
+        return make(f"geometry_msgs/msg/{type_name}", x=x, y=y, z=z)
 
     lifetime, markers = make_duration(lifetime_ns, make), []
     for row in rows:

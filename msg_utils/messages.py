@@ -17,8 +17,8 @@ def load_message_class(type_name: str) -> type[Any]:
     Raises:
         ModuleNotFoundError: The message package is not installed.
     """
-    package, kind, name = type_name.split("/")
-    return getattr(importlib.import_module(f"{package}.{kind}"), name)
+    package, folder, name = type_name.split("/")
+    return getattr(importlib.import_module(f"{package}.{folder}"), name)
 
 
 def make_ros_message(type_name: str, /, **fields: Any) -> Any:

@@ -11,7 +11,7 @@ import numpy as np
 
 # sensor_msgs/PointField datatypes
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-CODES = {kind: code for code, kind in DATATYPES.items()}
+CODES = {dtype: code for code, dtype in DATATYPES.items()}
 MAX_STEP = 2**20  # maximum bytes per point; NumPy's limit is 2**31
 
 
@@ -151,17 +151,17 @@ def from_array(points: np.ndarray, header: Any, make: Any, *, height: int = 1, i
 def make_point_fields(dtype: np.dtype, make: Any) -> list[Any]:
     """Build the PointField messages of a structured dtype."""
     fields = []
-    for name, (kind, offset, *_) in (dtype.fields or {}).items():
-        code = CODES.get(f"{kind.base.kind}{kind.base.itemsize}")
+    for name, (field_type, offset, *_) in (dtype.fields or {}).items():
+        code = CODES.get(f"{field_type.base.kind}{field_type.base.itemsize}")
         if code is None:
-            raise ValueError(f"field '{name}' of type {kind} has no PointField datatype")
+            raise ValueError(f"field '{name}' of type {field_type} has no PointField datatype")
         fields.append(
             make(
                 "sensor_msgs/msg/PointField",
                 name=name,
                 offset=offset,
                 datatype=code,
-                count=int(np.prod(kind.shape, dtype=int)),
+                count=int(np.prod(field_type.shape, dtype=int)),
             )
         )
     return fields
@@ -185,17 +185,17 @@ def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
     names = {f.name: f for f in fields}
     layout = {}
     for name, values in new.items():
-        kind = np.dtype(values.dtype).newbyteorder(byte_order)
-        code = CODES[f"{kind.kind}{kind.itemsize}"]
+        dtype = np.dtype(values.dtype).newbyteorder(byte_order)
+        code = CODES[f"{dtype.kind}{dtype.itemsize}"]
         existing_field = names.get(name)
         if existing_field is not None and existing_field.datatype == code and existing_field.count <= 1:
-            layout[name] = (existing_field.offset, kind)
+            layout[name] = (existing_field.offset, dtype)
             continue
         fields = [f for f in fields if f.name != name]
-        offset = -(-offset // kind.itemsize) * kind.itemsize  # aligned as in C structs
+        offset = -(-offset // dtype.itemsize) * dtype.itemsize  # aligned as in C structs
         fields.append(make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=code, count=1))
-        layout[name] = (offset, kind)
-        offset += kind.itemsize
+        layout[name] = (offset, dtype)
+        offset += dtype.itemsize
     # A point_step that is a multiple of 4 bytes keeps float fields aligned in every point.
     point_step = offset if offset == msg.point_step else -(-offset // 4) * 4
     data = np.zeros((len(points), point_step), np.uint8)
@@ -206,8 +206,8 @@ def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
                 (msg.height, msg.width * msg.point_step), np.uint8, source_bytes, strides=(source_row_step, 1)
             ).reshape(-1)
         data[:, : msg.point_step] = source_bytes[: len(points) * msg.point_step].reshape(-1, msg.point_step)
-        for name, (field_offset, kind) in layout.items():
-            np.ndarray(len(points), kind, data, offset=field_offset, strides=(point_step,))[:] = new[name]
+        for name, (field_offset, dtype) in layout.items():
+            np.ndarray(len(points), dtype, data, offset=field_offset, strides=(point_step,))[:] = new[name]
     return _make_cloud(
         msg.header,
         make,

@@ -113,7 +113,6 @@ class TransformTree:
     def __init__(self, keeps_all: bool = False) -> None:
         self._links: dict[str, _Link] = {}  # child frame -> link to its parent
         self._keeps_all = keeps_all
-        self.jumps = 0
 
     def set(
         self,
@@ -129,11 +128,8 @@ class TransformTree:
         A new parent of the child replaces the previous one.
 
         Args:
-            parent, child: Names of the frames.
-            stamp_ns: Time of the pose.
             translation: (3,) metres.
             quaternion: (4,) [x y z w].
-            static: True if the pose holds at all times.
 
         Raises:
             InputError: The values are not a pose, a name is empty, both names are the same, or the
@@ -153,14 +149,10 @@ class TransformTree:
             link = self._links[child] = _Link(parent, static, self._keeps_all)
         has_jumped_back = bool(link.times) and stamp_ns <= link.times[-1] - JUMP_NS
         if has_jumped_back and not static and not self._keeps_all:
-            self.forget()
+            # Time has jumped back: only static transforms are still valid.
+            self._links = {frame: known_link for frame, known_link in self._links.items() if known_link.static}
             link = self._links[child] = _Link(parent, static, self._keeps_all)
         link.add(stamp_ns, value)
-
-    def forget(self) -> None:
-        """Discard all moving transforms, because time jumped back."""
-        self._links = {child: link for child, link in self._links.items() if link.static}
-        self.jumps += 1
 
     def lookup(self, target: str, source: str, stamp_ns: int, max_gap: float | None = None) -> np.ndarray:
         """Return the pose (4, 4) of source in target at a time; it transforms source to target.
@@ -185,14 +177,14 @@ class TransformTree:
         """
         target, source = target.lstrip("/"), source.lstrip("/")
         source_chain, target_chain = self.find_chain(source), self.find_chain(target)
-        common = next((frame for frame in source_chain if frame in set(target_chain)), None)
-        if common is None:
+        common_ancestor = next((frame for frame in source_chain if frame in set(target_chain)), None)
+        if common_ancestor is None:
             raise MissingTransform(
                 f"TF does not connect '{source}' with '{target}': "
                 f"{self._describe(source, source_chain)}, {self._describe(target, target_chain)}"
             )
-        return invert_pose(self._compose(target_chain, common, at, max_gap)) @ self._compose(
-            source_chain, common, at, max_gap
+        return invert_pose(self._compose(target_chain, common_ancestor, at, max_gap)) @ self._compose(
+            source_chain, common_ancestor, at, max_gap
         )
 
     def is_fixed(self, frame: str) -> bool:
@@ -221,9 +213,9 @@ class TransformTree:
         parents = {link.parent for link in self._links.values()}
         return f"'{frame}' is " + ("the root of a tree" if frame in parents else "not in TF")
 
-    def _compose(self, chain: list[str], common: str, at: np.ndarray, max_gap: float | None) -> np.ndarray:
+    def _compose(self, chain: list[str], end: str, at: np.ndarray, max_gap: float | None) -> np.ndarray:
         pose = np.broadcast_to(np.eye(4), (len(at), 4, 4))
-        for child in chain[: chain.index(common)]:
+        for child in chain[: chain.index(end)]:
             link = self._links[child]
             pose = link.interpolate(at, f"'{link.parent}' -> '{child}'", max_gap) @ pose
         return pose

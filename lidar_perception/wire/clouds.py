@@ -36,19 +36,19 @@ DRIVER_BY_PACKAGE = {
 }
 
 
-def decode_cloud(data: bytes, kind: str) -> Any:
+def decode_cloud(data: bytes, type_name: str) -> Any:
     """Decode a cloud message in CDR, of one of CLOUD_TYPES, to a PointCloud2 (class of rosbags).
 
     Raises:
         InputError: The message is damaged, or its compression is not supported.
     """
-    if kind in LIVOX:
+    if type_name in LIVOX:
         return decode_livox(data)
-    msg = decode(data, kind)
-    return _decompress(msg) if kind == COMPRESSED else msg
+    msg = decode(data, type_name)
+    return _decompress(msg) if type_name == COMPRESSED else msg
 
 
-def check_readable(data: bytes, kind: str) -> None:
+def check_readable(data: bytes, type_name: str) -> None:
     """Check that the compression of a cloud message is supported.
 
     Damaged messages are accepted here; decode_cloud reports them.
@@ -56,9 +56,9 @@ def check_readable(data: bytes, kind: str) -> None:
     Raises:
         InputError: The compression is not supported.
     """
-    if kind == COMPRESSED:
+    if type_name == COMPRESSED:
         try:
-            msg = decode(data, kind)
+            msg = decode(data, type_name)
         except InputError:
             return
         _check_compression(msg)
@@ -70,7 +70,7 @@ def find_cloud_topics(topics: Mapping[str, str]) -> list[str]:
     Args:
         topics: Message type of each topic.
     """
-    clouds = {topic for topic, kind in topics.items() if kind in CLOUD_TYPES}
+    clouds = {topic for topic, type_name in topics.items() if type_name in CLOUD_TYPES}
     return sorted(topic for topic in clouds if topics[topic] != COMPRESSED or topic.rpartition("/")[0] not in clouds)
 
 
@@ -82,16 +82,16 @@ def diagnose_packets(topics: Mapping[str, str]) -> str | None:
     Args:
         topics: Message type of each topic.
     """
-    for topic, kind in sorted(topics.items()):
-        package, _, name = kind.replace("/msg/", "/").partition("/")
+    for topic, type_name in sorted(topics.items()):
+        package, _, name = type_name.replace("/msg/", "/").partition("/")
         if driver := DRIVER_BY_PACKAGE.get(package):
             return (
-                f"{kind} on {topic} contains raw sensor packets, which cannot be read: "
+                f"{type_name} on {topic} contains raw sensor packets, which cannot be read: "
                 f"play the bag to {driver} and record the clouds that it publishes"
             )
         if package == "sensor_msgs" and name in ("PointCloud", "LaserScan"):
             return (
-                f"{kind} on {topic} cannot be read: record its scans as PointCloud2, with "
+                f"{type_name} on {topic} cannot be read: record its scans as PointCloud2, with "
                 f"{'laser_geometry' if name == 'LaserScan' else 'point_cloud_converter'}"
             )
     return None

@@ -47,8 +47,8 @@ def load_typestore() -> Typestore:
 def make_bag_message(type_name: str, /, **fields: Any) -> Any:
     """Make a message of a rosbags class; fields that are not given are zero, empty or False."""
     names = {}
-    for name, kind in load_typestore().fielddefs[type_name][1]:
-        names[name] = fields.pop(name) if name in fields else _make_zero(kind)
+    for name, field_type in load_typestore().fielddefs[type_name][1]:
+        names[name] = fields.pop(name) if name in fields else _make_zero(field_type)
     if fields:
         raise TypeError(f"{type_name} has no field {next(iter(fields))!r}")
     return load_typestore().types[type_name](**names)
@@ -79,8 +79,8 @@ def warm_up_type(type_name: str) -> None:
         decode(encode(make_bag_message(type_name)), type_name)
 
 
-def _make_zero(type_name: tuple[Any, Any]) -> Any:
-    node, detail = type_name
+def _make_zero(field_type: tuple[Any, Any]) -> Any:
+    node, detail = field_type
     if node == Nodetype.BASE:
         name = detail[0]
         return {"string": "", "bool": False}.get(name, 0.0 if name.startswith("float") else 0)

@@ -17,7 +17,7 @@ from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import SECOND_NS, make_header
 
 FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
-PACKED = np.dtype([(name, f"<{kind}") for name, kind in FIELDS.items()])  # layout in ROS 1
+PACKED = np.dtype([(name, f"<{code}") for name, code in FIELDS.items()])  # layout in ROS 1
 OFFSETS = [0, 4, 8, 12, 16, 17, 18]  # offsets of the fields of a point, in bytes
 POINT_BYTES = 20  # size of a point in CDR, where each point starts at a multiple of 4
 FIXED_BYTES = 16  # size of the fields from timebase to rsvd
@@ -43,7 +43,7 @@ def decode_livox(data: bytes) -> Any:
             f"the Livox CustomMsg is truncated: {count} points need "
             f"{count * POINT_BYTES - 1} bytes, the message has {len(points)}"
         )
-    kind = np.dtype(
+    dtype = np.dtype(
         {
             "names": [*FIELDS],
             "formats": [f"{order}{code}" for code in FIELDS.values()],
@@ -52,7 +52,7 @@ def decode_livox(data: bytes) -> Any:
         }
     )
     header = make_header(seconds * SECOND_NS + nanoseconds, frame_id, make_bag_message)
-    return from_array(np.frombuffer(points + b"\0", kind, count), header, make_bag_message)
+    return from_array(np.frombuffer(points + b"\0", dtype, count), header, make_bag_message)
 
 
 def convert_livox_ros1_to_cdr(data: bytes) -> bytes:

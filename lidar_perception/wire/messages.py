@@ -42,7 +42,6 @@ def to_point_cloud(
     If the cloud has a column `in_view`, points where it is 0 are left out.
 
     Args:
-        msg: The PointCloud2.
         intensity_max: Intensity of a full reflection; 0: inferred by `scale`; None: do not read the
             intensity.
         scale: Function that infers the intensity of a full reflection, from this cloud
@@ -96,14 +95,7 @@ def read_raw_intensity(msg: Any) -> tuple[np.ndarray, np.dtype] | None:
 
 
 def diagnose_recorded_intensity(source: Any, clouds: Sequence[PointCloud]) -> str | None:
-    """Return a message with the remedy if the intensity scale of a recording is implausible.
-
-    Returns None if it is plausible.
-
-    Args:
-        source: Name of the recording.
-        clouds: Sample of its clouds.
-    """
+    """Return a message with the remedy if the intensity scale in some clouds of a recording is implausible, or None."""
     intensities = [cloud.intensity for cloud in clouds if cloud.intensity is not None]
     problem = find_scale_problem(np.concatenate(intensities)) if intensities else None
     return problem and (f"{source}: {problem}; for a bag or cloud files, set it with convert --robot")
@@ -132,8 +124,7 @@ def make_xyz_cloud(msg: Any, xyz: np.ndarray, indices: np.ndarray, make: Any) ->
     Args:
         msg: Cloud from which the header and the intensity are copied.
         xyz: (M, 3) coordinates of the new points.
-        indices: (M,) indices of these points in `msg`, to read their intensity.
-        make: Function that creates messages, see msg_utils.
+        indices: (M,) indices of these points in `msg`.
     """
     names = to_array(msg).dtype.names or ()
     fields = {axis: xyz[:, i] for i, axis in enumerate("xyz")}
@@ -300,8 +291,7 @@ def make_detection_rows(
     which does not fit into the 32 bits of a marker id.
 
     Args:
-        detections: The detections.
-        previous: See to_marker_array.
+        previous: Keys of the previous array, see to_marker_array.
         clusters: (K,) ids in the column `cluster_id` of the cloud if the detections are clusters.
     """
     labels = [CLASSES[i] for i in detections.class_ids]

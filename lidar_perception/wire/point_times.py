@@ -60,13 +60,13 @@ def read_point_times(msg: Any, indices: np.ndarray) -> PointTimes:
         raise InputError(f"field '{name}' has count > 1; it must have one number per point")
     is_integer = points[name].dtype.kind in "iu"
     column = points[name].astype(np.int64 if is_integer else np.float64)
-    finite, values = np.isfinite(column), column.take(indices)
-    finite_values = values[finite.take(indices)]
+    is_finite, values = np.isfinite(column), column.take(indices)
+    finite_values = values[is_finite.take(indices)]
     if not len(finite_values):
         raise InputError(f"all times in the column '{name}' are NaN or infinite")
     is_measured = column != 0
     is_measured[indices] = True
-    sweep_values = column[is_measured & finite]
+    sweep_values = column[is_measured & is_finite]
     low, span = finite_values.min(), sweep_values.max() - sweep_values.min()
     unit = LIVOX_UNIT_NS if (name, is_integer) == LIVOX_COLUMN else _infer_unit_ns(float(span), is_integer, float(low))
     stamp = to_ns(msg.header.stamp)
@@ -102,8 +102,7 @@ def deskew_points(
         msg: PointCloud2 with a time column.
         frame: N points of this cloud.
         indices: (N,) indices of these points in `msg`.
-        poses: Function that returns the poses (K, 4, 4) of the sensor in a fixed frame at times
-            (K,) in ns.
+        poses: Poses (K, 4, 4) of the sensor in a fixed frame, as a function of times (K,) in ns.
 
     Returns:
         Indices (M,) into `frame` of the points with a time, their corrected coordinates (M, 3), and
@@ -118,10 +117,10 @@ def deskew_points(
     if len(timed_indices) < len(frame):
         times = times._replace(seconds=times.seconds.take(timed_indices))
         xyz = xyz.take(timed_indices, axis=0)
-    deskewed = deskew(
+    deskewed_xyz = deskew(
         xyz, times.seconds, lambda seconds: poses(frame.stamp_ns + np.rint(seconds * SECOND_NS).astype(np.int64))
     )
-    return timed_indices, deskewed, times
+    return timed_indices, deskewed_xyz, times
 
 
 def deskew_frame(msg: Any, frame: PointCloud, indices: np.ndarray, poses: PoseLookup) -> PointCloud:
@@ -131,9 +130,9 @@ def deskew_frame(msg: Any, frame: PointCloud, indices: np.ndarray, poses: PoseLo
     """
     if (deskewed_points := deskew_points(msg, frame, indices, poses)) is None:
         return frame
-    timed_indices, deskewed, _ = deskewed_points
+    timed_indices, deskewed_xyz, _ = deskewed_points
     xyz = frame.xyz.copy()
-    xyz[timed_indices] = deskewed
+    xyz[timed_indices] = deskewed_xyz
     return replace(frame, xyz=xyz)
 
 

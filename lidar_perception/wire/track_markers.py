@@ -35,12 +35,11 @@ def make_track_rows(
 
     Args:
         ids: (K,) track ids.
-        detections: Boxes, classes and scores of the tracks.
         velocities: (K, 2) m/s.
         moving: (K,) probabilities of motion.
         trails: K arrays (N, 3) of past positions; a trail with one point is not drawn.
         extras: K dicts to add to the texts.
-        previous: See to_marker_array.
+        previous: Keys of the previous array, see to_marker_array.
     """
     numbers: list[int] = (np.asarray(ids) % MAX_ID).tolist()
     labels, boxes = [CLASSES[i] for i in detections.class_ids], detections.boxes.astype(float)

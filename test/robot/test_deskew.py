@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from motion_samples import skew
+from motion_samples import make_constant_motion, skew
 from scipy.spatial.transform import Rotation
 
-from lidar_perception.robot.deskew import MAX_POSES, deskew, make_constant_motion
+from lidar_perception.robot.deskew import MAX_POSES, deskew
 
 numbers = st.floats(-1, 1, allow_subnormal=False)
 

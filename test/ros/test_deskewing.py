@@ -8,10 +8,10 @@ from motion_samples import skew
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
+from motion_samples import make_constant_motion
 from robot_messages import PERIOD, START, give, message, mount_pose, odometry, problems, transforms
 
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
-from lidar_perception.robot.deskew import make_constant_motion
 from lidar_perception.wire.codec import decode, encode, make_bag_message
 from lidar_perception.wire.messages import read_column, to_point_cloud
 from msg_utils.point_cloud2 import to_array
