@@ -54,7 +54,7 @@ def load_detector(
     min_score: float | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Detector:
-    """Load a detector; detector(cloud).detections are the objects found in a cloud.
+    """Load a detector. `detector(cloud).detections` holds the objects found in a cloud.
 
     Args:
         name_or_file: a detector with the weights of the package (fused, pointpillars or pointnet);
@@ -246,7 +246,7 @@ def simulate(
     people: float = 1.0,
     sensor_height: float | None = None,
 ) -> Recording:
-    """Simulate labelled scans, which are computed when they are read.
+    """Simulate labelled scans. Each scan is computed when it is read.
 
     Args:
         frames: number of scans. A new scene starts after each drive of 20 s.

@@ -19,8 +19,7 @@ class Camera:
 
     Attributes:
         projection: (3, 4) float64, maps homogeneous LiDAR points to pixels times depth.
-        width: width of the image in pixels.
-        height: height of the image in pixels.
+        width, height: size of the image in pixels.
     """
 
     projection: np.ndarray
@@ -45,8 +44,7 @@ class Camera:
             rotation: quaternion [x y z w] of the optical frame (x right, y down, z forward), as in
                 TF.
             translation: (3,) metres.
-            width: width of the image in pixels.
-            height: height of the image in pixels.
+            width, height: size of the image in pixels.
         """
         to_lidar = Rotation.from_quat(rotation)
         return Camera.from_lidar_pose(
@@ -79,10 +77,10 @@ class Camera:
             regions: (R, 4) [left top right bottom] in pixels; they may extend beyond the image.
         """
         u, v, depth = (np.asarray(xyz, np.float64) @ self.projection[:, :3].T + self.projection[:, 3]).T
-        inside = np.zeros(len(xyz), bool)
+        is_inside = np.zeros(len(xyz), bool)
         for left, top, right, bottom in np.reshape(regions, (-1, 4)):
-            inside |= (left * depth <= u) & (u < right * depth) & (top * depth <= v) & (v < bottom * depth)
-        return inside & (depth > 0)
+            is_inside |= (left * depth <= u) & (u < right * depth) & (top * depth <= v) & (v < bottom * depth)
+        return is_inside & (depth > 0)
 
 
 @njit(cache=True, nogil=True)
@@ -106,8 +104,7 @@ class Calibration:
         intrinsics: (3, 4), P2 in KITTI.
         lidar_to_camera: (4, 4) transform of LiDAR points to the rectified camera frame
             (R0_rect Tr_velo_to_cam in KITTI).
-        width: width of the image in pixels.
-        height: height of the image in pixels.
+        width, height: size of the image in pixels.
     """
 
     intrinsics: np.ndarray

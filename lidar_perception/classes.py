@@ -17,8 +17,8 @@ class DetectionConstants:
 
     Attributes:
         anchor: size of the anchor box of PointPillars.
-        matched, unmatched: an anchor is positive at a BEV IoU of at least `matched`, and background
-            below `unmatched` (Lang et al., CVPR 2019, Section 4.1 and its code).
+        matched: minimum BEV IoU of a positive anchor (Lang et al., CVPR 2019, Section 4.1).
+        unmatched: BEV IoU below which an anchor is background.
         mean_size: mean size of KITTI's labels; PointNet's sizes are relative to it.
         min_diagonal: minimum diagonal of a cluster's box in x-y, in metres. The ranges 0.40-1.71,
             1.72-2.99 and 3.00-6.40 of paper B, Table 2, are rounded; here each extends to the next.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import DTypeLike
 
-MAX_UNIT = 1.5  # maximum intensity on the scale 0..1, which noise and calibration can exceed slightly
+MAX_UNIT = 1.5  # largest intensity accepted on the scale 0..1, because noise and calibration can exceed 1 slightly
 PERCENT = 100.0
 BITS = (255.0, 1023.0, 4095.0, 65535.0)  # full scale with 8, 10, 12 and 16 bits
 TOLERANCE = 1.001  # factor by which a rounded value may exceed its scale
@@ -116,9 +116,9 @@ def normalize_intensity(intensity: np.ndarray | None, indices: np.ndarray | None
     mean_values = np.bincount(inverse, REFERENCE_VALUES) / np.bincount(inverse)
     if indices is not None:
         intensity = intensity.take(indices)
-    normalized = np.interp(intensity, distinct_knots, mean_values).astype(np.float32)
-    normalized[intensity <= 0] = 0
-    return normalized
+    result = np.interp(intensity, distinct_knots, mean_values).astype(np.float32)
+    result[intensity <= 0] = 0
+    return result
 
 
 def _compute_quantiles(values: np.ndarray, fractions: np.ndarray) -> np.ndarray:
@@ -150,7 +150,7 @@ def has_usable_intensity(intensity: np.ndarray | None) -> bool:
 class StreamScale:
     """Intensity scale of a stream of clouds: the largest scale inferred from any cloud so far.
 
-    So a dark cloud does not change the scale. `full_scale` is 0 before the first cloud.
+    A dark cloud therefore does not change the scale. `full_scale` is 0 before the first cloud.
     """
 
     def __init__(self) -> None:
@@ -163,18 +163,18 @@ class StreamScale:
 
 
 def find_scale_problem(intensity: np.ndarray | None) -> str | None:
-    """Describe a wrong scale of intensities (N,) that should be 0..1, with the remedy, or return None."""
+    """Return a message about intensities (N,) that are not on the scale 0..1, with the remedy, or None."""
     if intensity is None:
         return None
     max_value = float(np.fmax.reduce(intensity, initial=0))
-    inferred = guess_scale(intensity)
-    if inferred == 1.0 and (max_value == 0.0 or max_value >= MIN_BRIGHT or len(intensity) < MIN_POINTS):
+    guessed_scale = guess_scale(intensity)
+    if guessed_scale == 1.0 and (max_value == 0.0 or max_value >= MIN_BRIGHT or len(intensity) < MIN_POINTS):
         return None
-    guess_text = f", so a full scale of {inferred:g} is assumed" if inferred != 1.0 else ""
+    guess_text = f", so a full scale of {guessed_scale:g} is assumed" if guessed_scale != 1.0 else ""
     return (
         f"the highest intensity is {max_value:.3g}, but a full reflection should be 1{guess_text}; set "
-        "input.intensity_max, or in Python intensity_max of PointCloud.of, to the value of a "
-        "full reflection (1, 100 or 255 for most drivers; setup measures it)"
+        "input.intensity_max, or in Python intensity_max of PointCloud.of, to the value of a full reflection (1, 100 "
+        "or 255 for most drivers; setup measures it)"
     )
 
 

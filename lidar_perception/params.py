@@ -32,8 +32,7 @@ class ReceptionParams(Params):
 
     reliability: str = param(
         "auto",
-        "auto: reliable if every publisher of the topic offers it, "
-        "otherwise best_effort. "
+        "auto: reliable if every publisher of the topic offers it, otherwise best_effort. "
         "qos_overrides.TOPIC.subscription.reliability takes precedence.",
         choices=("auto", "reliable", "best_effort"),
     )
@@ -46,8 +45,8 @@ class ReceptionParams(Params):
     )
     max_wait: float = param(
         10.0,
-        "Maximum time that a cloud waits for other data, such as a "
-        "transform or, with view.enabled, the camera calibration.",
+        "Maximum time that a cloud waits for other data, such as a transform or, with view.enabled, the camera "
+        "calibration.",
         unit="s",
         low=0.0,
         high=3600.0,
@@ -85,10 +84,8 @@ class ReceptionParams(Params):
     )
     deskew: str = param(
         "off",
-        "Motion correction: move points to their position at "
-        "header.stamp, with the cloud's time column and odometry "
-        "(~/input/odometry, nav_msgs/Odometry) or tf (transforms from "
-        "`input.fixed_frame`). off: no correction.",
+        "Motion correction: move points to their position at header.stamp, with the cloud's time column and odometry "
+        "(~/input/odometry, nav_msgs/Odometry) or tf (transforms from `input.fixed_frame`). off: no correction.",
         choices=("off", "odometry", "tf"),
         fixed=True,
     )
@@ -97,9 +94,8 @@ class ReceptionParams(Params):
     )
     ahead: float = param(
         0.0,
-        "Forward direction of the detectors: degrees from the clouds' x "
-        "axis, counter-clockwise, 90 if y points forward. Results stay in the "
-        "cloud's frame.",
+        "Forward direction of the detectors, measured from the clouds' x axis, counter-clockwise; 90 if y points "
+        "forward. Results stay in the cloud's frame.",
         unit="deg",
         low=-180.0,
         high=360.0,
@@ -113,9 +109,8 @@ class MarkerParams(Params):
 
     marker_lifetime: float = param(
         2.0,
-        "Lifetime of markers after their last update, at least "
-        "2.5 periods of the rate (`input.rate`), so that the markers "
-        "of a dead node disappear; 0: no limit.",
+        "Lifetime of markers after their last update, at least 2.5 periods of the rate (`input.rate`), so that the "
+        "markers of a dead node disappear; 0: no limit.",
         unit="s",
         low=0.0,
         high=1e6,
@@ -143,15 +138,14 @@ class CloudNodeParams(Params):
     input: ReceptionParams = ReceptionParams()
     base_frame: str = param(
         "",
-        "A frame on the ground, such as base_footprint. If set, height, roll "
-        "and pitch of the sensor come from TF instead of ground.sensor_pose, "
-        "and all computations use the levelled cloud. Empty: off.",
+        "A frame on the ground, such as base_footprint. If set, height, roll and pitch of the sensor come from TF "
+        "instead of ground.sensor_pose, and all computations use the levelled cloud. Empty: off.",
         fixed=True,
     )
     autostart: bool = param(
         True,
-        "Configure and activate the node at the start. false: a lifecycle manager, such as Nav2's, or "
-        "`ros2 lifecycle` does it.",
+        "Configure and activate the node at the start. false: leave this to a lifecycle manager, such as Nav2's, or "
+        "to `ros2 lifecycle`.",
         fixed=True,
     )
 
@@ -201,7 +195,10 @@ class PerceptionExtraParams(DetectionNodeParams):
 
 @dataclass(frozen=True)
 class TrackerExtraParams(CloudNodeParams):
-    """Additional parameters of the tracker node. Its input queue is longer, so that no detections are skipped."""
+    """Additional parameters of the tracker node.
+
+    Its input queue is longer than that of other nodes, so that no detections are skipped.
+    """
 
     input: ReceptionParams = ReceptionParams(queue=10)
     output: TrackMarkerParams = TrackMarkerParams()
@@ -257,17 +254,15 @@ class PlayerParams(Params):
     )
     wait_for: tuple[str, ...] = param(
         str,
-        "Topics that must have a subscriber, or COUNT subscribers "
-        "with TOPIC:=COUNT, before the first message is sent. Topics "
-        "of other nodes are allowed. Empty: the bag's clouds.",
+        "Topics that must have a subscriber, or COUNT subscribers with TOPIC:=COUNT, before the first message is "
+        "sent. They may be topics of other nodes. Empty: the bag's clouds.",
         fixed=True,
     )
     follow: tuple[str, ...] = param(
         str,
-        "Topics of detections (MarkerArray): the next cloud is "
-        "sent when the detections of the previous clouds have arrived "
-        "on all of them, so that no cloud is lost; meanwhile the bag's "
-        "time is paused. Empty: play in real time, like a sensor.",
+        "Topics of detections (MarkerArray): the next cloud is sent when the detections of the previous clouds have "
+        "arrived on all of these topics, so that no cloud is lost; meanwhile the bag's time is paused. Empty: play "
+        "in real time, like a sensor.",
         fixed=True,
     )
     ahead: int = param(

@@ -132,10 +132,10 @@ class PointCloud:
 
         Args:
             points: (N, 3) [x y z] or (N, 4) [x y z intensity] of any real type; metres, x forward,
-                y left, z up. An empty sequence is a cloud without points.
+                y left, z up; or an empty sequence.
             intensity: (N,) for points (N, 3). NaN, infinite and negative values become 0.
-            intensity_max: value of a full reflection, by which intensities are divided. None: 255
-                for uint8, otherwise 1. Detectors report intensities with an implausible scale.
+            intensity_max: intensity of a full reflection, by which all intensities are divided.
+                None: 255 for uint8, otherwise 1. Detectors report an implausible scale.
 
         Raises:
             InputError: an array has a wrong shape or type.
@@ -250,8 +250,8 @@ class Detections:
         boxes: (K, 7) float32 [x y z l w h yaw].
         class_ids: (K,) int32 indices into CLASSES.
         scores: (K,) float32.
-        sources: probabilities (K,) float32 from each part of a combined detector, by the name of
-            the part; NaN for boxes that the part did not score. Empty for other detectors.
+        sources: probabilities (K,) float32 from each part of the fused detector, by the name of the
+            part; NaN for boxes that the part did not score. Empty for other detectors.
     """
 
     boxes: np.ndarray

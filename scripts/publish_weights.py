@@ -20,13 +20,7 @@ import click
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors import checkpoint
-from lidar_perception.detectors.checkpoint import (
-    POINTNET,
-    read_header,
-    read_network_name,
-    require_same_config,
-    save_checkpoint,
-)
+from lidar_perception.detectors.checkpoint import POINTNET, read_header, require_same_config, save_checkpoint
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointnet.network import load_pointnet
@@ -176,7 +170,7 @@ def main(weights: Path, folders: tuple[Path, ...], second_path: Path | None, jud
         content = {folder.name: evaluate_weights(weights, folder) for folder in folders}
         write_text(weights.with_suffix(".md"), format_card(read_header(weights), weights.stem, content))
         return
-    load = load_pointnet if read_network_name(weights) == POINTNET else load_network
+    load = load_pointnet if read_header(weights).network == POINTNET else load_network
     header, network = load(weights)
     if second_path is not None:
         second_header, second_network = load(second_path)

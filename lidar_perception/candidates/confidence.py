@@ -52,7 +52,6 @@ def compute_shape_features(
         xyz: (N, 3) points, sorted by cluster.
         start: (K + 1,) first row of each cluster, as in silhouette.py.
         boxes: (K, 7) boxes of the clusters, extended down to the ground.
-        params: Parameters of the pipeline.
 
     Returns:
         Arrays (K,) float64 by name:
@@ -114,12 +113,12 @@ def compute_confidence(
 
 
 def compute_log_odds(model: Mapping[str, Any], features: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Compute the log-odds (K,) float64 of K objects.
+    """Compute the log-odds (K,) float64 of K objects as the sum of a bias and one curve per feature.
 
     Args:
-        model: `bias`, and `curves` with the `knots` and `values` of each feature. Curves are
-            constant beyond their first and last knot. For a feature that is NaN, the `unknown`
-            value of its curve is added, by default 0.
+        model: `bias`, and `curves` with the `knots` and `values` of each feature. Curves are linear
+            between knots and constant beyond the first and the last one. For a feature that is NaN,
+            the `unknown` value of its curve is added, by default 0.
         features: Arrays (K,) by name.
     """
     log_odds = np.full(len(next(iter(features.values()))), float(model["bias"]))

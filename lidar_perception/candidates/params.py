@@ -43,8 +43,8 @@ class StmParams(Params):
     )
     window: str = param(
         "stretched",
-        "stretched: silhouettes are stretched to fill the window. "
-        "metric: the window is 1.6 m wide and 2.4 m high, and starts at the ground.",
+        "stretched: silhouettes are stretched to fill the window. metric: the window is 1.6 m wide and 2.4 m high, and "
+        "starts at the ground.",
         choices=SILHOUETTE_WINDOWS,
     )
     axis: str = param(
@@ -54,15 +54,14 @@ class StmParams(Params):
     )
     spread: bool = param(
         False,
-        "Draw every point as large as the surface that it represents "
-        "(see resolution), so that a silhouette does not depend on the range.",
+        "Draw every point as large as the surface that it represents (see resolution), so that a silhouette does not "
+        "depend on the range.",
     )
     dilations: int = param(1, "Number of 3 x 3 dilations of the silhouette.", low=0, high=10)
     seen_only: bool = param(
         False,
-        "With the metric window: compare only the part above the lowest "
-        "points of the cluster and of the seed, because below that one of "
-        "them is hidden.",
+        "With the metric window: compare only the part above the lowest points of both the cluster and the seed, "
+        "because one of them is hidden below that height.",
     )
     shifts: int = param(
         0, "Maximum horizontal shift of a silhouette, in columns, to match the seed's silhouette.", low=0, high=16
@@ -86,12 +85,12 @@ class CpaParams(Params):
 
 @dataclass(frozen=True)
 class ConfidenceParams(Params):
-    """Probability of each candidate, from its shape and its similarity to the seed."""
+    """Confidence: the probability that a candidate is a pedestrian, from its shape and similarity to the seed."""
 
     enabled: bool = param(
         False,
-        "Accept candidates by confidence instead of similarity, and use the "
-        "confidence as the score. It was fitted with the configuration best.",
+        "Accept candidates by confidence instead of similarity, and use the confidence as the score. The confidence "
+        "was fitted with the configuration best.",
     )
     threshold: float = param(0.5, "Minimum confidence of a candidate.", low=0.0, high=1.0)
 
@@ -105,17 +104,16 @@ class SeedParams(Params):
 
     source: str = param(
         "file",
-        "ground_truth: the nearest labelled Pedestrian of the frame (the "
-        "paper's protocol). click: the cluster at /clicked_point. file: a saved "
-        "template. automatic: up to 8 clusters of the frame that PointNet "
-        "classifies as pedestrians; without one there are no candidates.",
+        "ground_truth: the nearest labelled Pedestrian of the frame (the paper's protocol). click: the cluster at "
+        "/clicked_point. file: a saved template. automatic: up to 8 clusters of the frame that PointNet classifies as "
+        "pedestrians; without one there are no candidates.",
         choices=SEED_SOURCES,
     )
     file: str = param("", "Template file for source 'file', or several separated by commas; empty: the shipped one.")
     bank: int = param(
         1,
-        "For source 'click': number of most recent clicks to keep as seeds. "
-        "Clusters are compared with all seeds, and the most similar one counts.",
+        "For source 'click': number of most recent clicks to keep as seeds. Each cluster is compared with all of them, "
+        "and the highest similarity counts.",
         low=1,
         high=16,
     )

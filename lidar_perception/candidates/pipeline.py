@@ -37,7 +37,6 @@ def segment_cloud(
     Args:
         cloud: A PointCloud, or an array (N, 3) or (N, 4) as for PointCloud.of.
         camera: Camera, required if params.view is enabled.
-        params: Parameters of the pipeline.
         ground: (N,) bool mask of the ground points; computed if None.
         cluster_ids: (N,) ids from any clustering; computed if None.
 
@@ -81,14 +80,7 @@ def find_candidates(
     params: PipelineParams = PipelineParams(),
     **columns: np.ndarray | None,
 ) -> tuple[SegmentedCloud, Candidates]:
-    """Run all stages of the pipeline on one cloud.
-
-    Args:
-        cloud: See segment_cloud.
-        seed: Source of the seed pedestrians.
-        camera: See segment_cloud.
-        params: Parameters of the pipeline.
-        columns: `ground` and `cluster_ids` of segment_cloud.
+    """Run all stages of the pipeline on one cloud, with the arguments of segment_cloud and a seed source.
 
     Returns:
         The segmented cloud and the candidates, whose `ms` has the durations of all STEPS.

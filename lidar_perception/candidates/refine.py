@@ -63,7 +63,6 @@ def refine_clusters(
         labels: (N,) cluster of each point, 0 for none.
         boxes: (K, 7) boxes of the clusters, snapped to the ground.
         seeds: Seed pedestrians. Without one there are no candidates.
-        params: Parameters of the pipeline.
     """
     t0 = perf_counter()
     has_seed_height = np.zeros((len(seeds), len(boxes)), bool)

@@ -10,7 +10,7 @@ from lidar_perception.candidates.params import SeedParams
 from lidar_perception.candidates.seeds import Seed, seed_from_click, seed_from_truth
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud
 
-# Returns one or more seeds for a segmented cloud; clusters are compared with the most similar one.
+# Function that returns one or more seeds for a segmented cloud. The most similar seed of a cluster counts.
 SeedSource = Callable[[SegmentedCloud], tuple[Seed, ...]]
 
 

@@ -78,8 +78,7 @@ def seed_from_truth(xyz: np.ndarray, ground: np.ndarray, pedestrians: np.ndarray
     The seed consists of the points in the box that are not ground, and has the height of the box.
 
     Args:
-        xyz: (N, 3) points.
-        ground: (N,) bool mask of the ground points.
+        ground: (N,) bool mask of the ground points among xyz (N, 3).
         pedestrians: (M, 7) labelled boxes.
 
     Raises:
@@ -87,19 +86,14 @@ def seed_from_truth(xyz: np.ndarray, ground: np.ndarray, pedestrians: np.ndarray
     """
     if len(pedestrians) == 0:
         raise InputError("no seed, because the ground truth of this frame has no Pedestrian")
-    nearest = pedestrians[np.argmin(np.hypot(pedestrians[:, 0], pedestrians[:, 1]))]
-    return seed_from_points(xyz[points_in_box(xyz, nearest) & ~ground], nearest, confidence=1.0)
+    nearest_pedestrian = pedestrians[np.argmin(np.hypot(pedestrians[:, 0], pedestrians[:, 1]))]
+    return seed_from_points(xyz[points_in_box(xyz, nearest_pedestrian) & ~ground], nearest_pedestrian, confidence=1.0)
 
 
 def seed_from_click(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray, radius: float) -> Seed:
-    """Make a seed from the cluster nearest to a clicked point.
+    """Make a seed from the cluster nearest to a clicked point, see find_clicked_cluster.
 
-    Args:
-        click: (3,) point in the frame of the cloud.
-        xyz: (N, 3) points.
-        labels: (N,) cluster 1..K of each point, 0 for none.
-        boxes: (K, 7) boxes of the clusters, snapped to the ground.
-        radius: Maximum distance to the cluster, metres.
+    The boxes (K, 7) of the clusters reach down to the ground.
 
     Raises:
         InputError: See find_clicked_cluster, or the cluster has too few points.
@@ -136,7 +130,7 @@ def find_clicked_cluster(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray,
 
 
 def save_seed(seed: Seed, path: str | Path) -> None:
-    """Write a template as JSON, with the points, and the silhouette as text for human readers."""
+    """Write a template as JSON, with its points and its silhouette drawn as text."""
     rows = ["".join(".#"[bit] for bit in row) for row in to_pixels(seed.draw_silhouette()).astype(int)]
     points = [[round(float(value), DECIMALS) for value in point] for point in seed.xyz]
     write_text(

@@ -63,17 +63,17 @@ def is_person_sized(boxes: np.ndarray) -> np.ndarray:
 def snap_to_ground(boxes: np.ndarray, plane: np.ndarray | None) -> np.ndarray:
     """Return boxes (K, 7) extended down to the plane below their centres (Section 3.4).
 
-    Boxes that already reach below the plane are not changed. If the plane is None, no box is.
+    Boxes that already reach below the plane are not changed. Without a plane (None), no box is changed.
     """
-    extended = boxes.copy()
+    extended_boxes = boxes.copy()
     if plane is None:
-        return extended
+        return extended_boxes
     plane_z = boxes[:, :2].astype(np.float64) @ plane[:2] + plane[2]
     top = boxes[:, 2] + boxes[:, 5] / 2
     bottom = np.minimum(boxes[:, 2] - boxes[:, 5] / 2, plane_z)
-    extended[:, 2] = (top + bottom) / 2
-    extended[:, 5] = top - bottom
-    return extended
+    extended_boxes[:, 2] = (top + bottom) / 2
+    extended_boxes[:, 5] = top - bottom
+    return extended_boxes
 
 
 def fit_ground_plane(ground: np.ndarray, params: BoxParams) -> np.ndarray | None:

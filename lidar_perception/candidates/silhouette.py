@@ -41,7 +41,6 @@ def draw_silhouettes(
         scales: (K, S) float64 scales a_k of the CPA copies; 1 for the original points (see
             compute_cpa_scales).
         floors: (K,) z of the ground below each cluster, for the metric window only.
-        params: Parameters of the pipeline.
 
     Returns:
         (K, 80) uint32.
@@ -69,10 +68,10 @@ def compute_cpa_scales(ranges: np.ndarray, params: CpaParams) -> np.ndarray:
     points.
     """
     steps = np.arange(1 + params.steps)
-    contracted = np.maximum(params.min_scale, 1.0 - steps * params.decrement)
-    contracted[0] = 1.0
-    in_range = (ranges >= params.min_range) & (ranges < params.max_range)
-    return np.where(in_range[:, None], contracted, 1.0)
+    copy_scales = np.maximum(params.min_scale, 1.0 - steps * params.decrement)
+    copy_scales[0] = 1.0
+    is_in_range = (ranges >= params.min_range) & (ranges < params.max_range)
+    return np.where(is_in_range[:, None], copy_scales, 1.0)
 
 
 def compute_similarity(images: np.ndarray, template: np.ndarray, params: StmParams = StmParams()) -> np.ndarray:

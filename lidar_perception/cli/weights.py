@@ -61,9 +61,9 @@ def onnx(weights: Path, out: Path) -> None:
       lidar-perception export onnx v4.safetensors --out v4.onnx
       lidar-perception export onnx pointnet/best.safetensors --out pointnet.onnx
     """
-    from lidar_perception.detectors.checkpoint import POINTNET, read_network_name
+    from lidar_perception.detectors.checkpoint import POINTNET, read_header
 
-    if read_network_name(weights) == POINTNET:
+    if read_header(weights).network == POINTNET:
         from lidar_perception.detectors.pointnet import onnx as pointnet
         from lidar_perception.detectors.pointnet.network import load_pointnet
 

@@ -29,8 +29,8 @@ def measure_density(xyz: np.ndarray) -> float:
         xyz: (N, 3) float32 in sensor coordinates, metres; N may be 0.
 
     Returns:
-        Points per square degree, 0 if no two usable points share a cell of CELL_DEG. KITTI's
-        HDL-64E has 13 to 16.
+        Points per square degree; 0 if no two usable points share a cell of CELL_DEG. For KITTI's
+        HDL-64E, the result is 13 to 16.
     """
     step = max(len(xyz) // MAX_SAMPLED, 1)
     sample = np.ascontiguousarray(xyz[::step])
@@ -102,18 +102,10 @@ def _reduce_count(count: int, factor: float, minimum: int) -> int:
 
 
 def compute_radii(xyz: np.ndarray, density: float, low: float, high: float) -> np.ndarray:
-    """Compute each point's radius for the local threshold.
+    """Compute the radius (N,) float64, in metres, for the local threshold of each point (N, 3).
 
-    The radius grows with the point's horizontal range and shrinks with the density of the cloud.
-
-    Args:
-        xyz: (N, 3) points in metres.
-        density: points per square degree.
-        low: smallest radius in metres.
-        high: largest radius in metres.
-
-    Returns:
-        (N,) float64 radii in metres.
+    The radius grows with the point's horizontal range and shrinks with the density of the cloud, in
+    points per square degree. It is limited to low..high.
     """
     ranges = horizontal_range(xyz).astype(np.float64)
     return np.clip(SPACINGS_PER_RADIUS * compute_point_spacing(density) * ranges, low, high)

@@ -15,8 +15,8 @@ import numpy as np
 CUBES_PER_REACH = 32
 # Fraction of the reach: each point of a pair may be a cube's diagonal away from its representative.
 SLACK = 2 * 3**0.5 / CUBES_PER_REACH
-MAX_DISTANCES_PER_POINT = 2_000
-MIN_DISTANCES = 2**30  # minimum budget of a search in distances, about a second
+MAX_DISTANCES_PER_POINT = 2_000  # maximum number of distances of an exact search, per point
+MIN_DISTANCES = 2**30  # lower limit of that maximum in distances per cloud; they take about a second
 
 
 def compute_max_exact_distances(count: int) -> float:

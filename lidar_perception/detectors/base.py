@@ -57,7 +57,7 @@ class NetworkDetector:
 
     @property
     def settings(self) -> NetworkParams:
-        """The detector's own parameter group, `group` of `params`."""
+        """The detector's own parameter group: the attribute of `params` whose name is `group`."""
         return getattr(self.params, self.group)
 
     @property

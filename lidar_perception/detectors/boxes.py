@@ -25,14 +25,14 @@ def move_towards(boxes: np.ndarray, others: np.ndarray, weight: float) -> np.nda
     """Interpolate between the boxes (K, 7) of two networks.
 
     Args:
-        others: (K, 7) boxes of the same objects; NaN: do not change this box.
+        others: (K, 7) boxes of the same objects; a row with NaN leaves its box unchanged.
         weight: 0 returns `boxes`, 1 returns `others`, except that the front stays on the same side.
     """
     difference = np.where(np.isfinite(others), others - boxes, 0.0)
     difference[:, 6] = wrap_line(difference[:, 6])
-    moved = boxes + weight * difference
-    moved[:, 6] = wrap_angle(moved[:, 6])
-    return moved
+    moved_boxes = boxes + weight * difference
+    moved_boxes[:, 6] = wrap_angle(moved_boxes[:, 6])
+    return moved_boxes
 
 
 def move_to_ground(boxes: np.ndarray, ground_heights: np.ndarray, weight: float) -> np.ndarray:
@@ -42,18 +42,18 @@ def move_to_ground(boxes: np.ndarray, ground_heights: np.ndarray, weight: float)
         ground_heights: (K,) z of the ground below each box; a box with NaN is not moved.
         weight: 0 keeps the boxes, 1 moves their bottoms onto the ground.
     """
-    moved = boxes.copy()
+    moved_boxes = boxes.copy()
     offset = weight * (ground_heights - (boxes[:, 2] - boxes[:, 5] / 2))
-    moved[:, 2] += np.where(np.isfinite(offset), offset, 0.0)
-    return moved
+    moved_boxes[:, 2] += np.where(np.isfinite(offset), offset, 0.0)
+    return moved_boxes
 
 
 def move_cars_to_points(boxes: np.ndarray, class_ids: np.ndarray, xyz: np.ndarray, weight: float) -> np.ndarray:
     """Apply move_to_points to the cars among boxes (K, 7), and return all boxes as float64."""
-    moved, is_car = np.array(boxes, np.float64), class_ids == CAR
+    moved_boxes, is_car = np.array(boxes, np.float64), class_ids == CAR
     if weight and is_car.any():
-        moved[is_car] = move_to_points(moved[is_car], xyz, weight)
-    return moved
+        moved_boxes[is_car] = move_to_points(moved_boxes[is_car], xyz, weight)
+    return moved_boxes
 
 
 def move_to_points(boxes: np.ndarray, xyz: np.ndarray, weight: float) -> np.ndarray:
@@ -71,7 +71,7 @@ def move_to_points(boxes: np.ndarray, xyz: np.ndarray, weight: float) -> np.ndar
 
 @njit(cache=True, nogil=True)
 def _move_to_points(boxes, points, first, weight):
-    moved = boxes.copy()
+    moved_boxes = boxes.copy()
     for k in range(len(boxes)):
         x, y, z = boxes[k, :3]
         cos, sin = np.cos(boxes[k, 6]), np.sin(boxes[k, 6])
@@ -91,6 +91,6 @@ def _move_to_points(boxes, points, first, weight):
             depth = quantile(half_size - sign * face_xy[:, axis], FACE_QUANTILE)
             expected_depth = SIDE_DEPTH if axis == 1 else (FRONT_DEPTH if sign > 0 else REAR_DEPTH)
             offset = -sign * weight * min(max(depth - expected_depth, -MARGIN_M), MARGIN_M)
-            moved[k, 0] += offset * (cos if axis == 0 else -sin)
-            moved[k, 1] += offset * (sin if axis == 0 else cos)
-    return moved
+            moved_boxes[k, 0] += offset * (cos if axis == 0 else -sin)
+            moved_boxes[k, 1] += offset * (sin if axis == 0 else cos)
+    return moved_boxes

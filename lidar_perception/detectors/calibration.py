@@ -23,9 +23,9 @@ def calibrate_scores(detections: Detections, lines: CalibrationLines) -> Detecti
     """Replace scores by calibrated probabilities; scores of classes without a line do not change."""
     scores = detections.scores.copy()
     for name, (slope, offset) in lines.items():
-        in_class = detections.class_ids == CLASSES.index(name)
+        is_in_class = detections.class_ids == CLASSES.index(name)
         with np.errstate(divide="ignore"):  # scores 0 and 1 are mapped to themselves
-            scores[in_class] = expit(slope * logit(scores[in_class].astype(np.float64)) + offset)
+            scores[is_in_class] = expit(slope * logit(scores[is_in_class].astype(np.float64)) + offset)
     return replace(detections, scores=scores)
 
 

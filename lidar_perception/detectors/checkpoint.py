@@ -25,7 +25,7 @@ from lidar_perception.types import CLASSES, InputError
 KEY = "lidar_perception"  # metadata key of the header, a JSON string
 FORMAT = 1
 MAX_COEFFICIENT = 100.0  # maximum absolute value of a slope or offset of a calibration
-MIN_HEIGHT_DIFFERENCE_M = 0.3  # smaller differences in mounting height need no warning
+MIN_HEIGHT_DIFFERENCE_M = 0.3  # minimum difference in mounting height for a warning
 
 if TYPE_CHECKING:
     import torch
@@ -78,15 +78,15 @@ class Header:
         return self.config.network
 
     def find_height_mismatch(self, height: float) -> str | None:
-        """Return a warning if the weights were trained for a different sensor height than `height` metres.
+        """Return a warning if the weights were trained for a sensor height other than `height` metres.
 
-        None if the heights agree or the height in training is unknown.
+        It is None if the heights agree or the height in training is unknown.
         """
         sensor = self.training.get("sensor")
         if (
             not isinstance(sensor, dict)
             or not isinstance(sensor.get("height"), float)
-            or (abs(sensor["height"] - height) < MIN_HEIGHT_DIFFERENCE_M)
+            or abs(sensor["height"] - height) < MIN_HEIGHT_DIFFERENCE_M
         ):
             return None
         sensor_text = f"the sensor {sensor['name']}" if sensor.get("name") else "a sensor"
@@ -173,15 +173,6 @@ def _parse_calibration(content: Any, source: str) -> dict[str, tuple[float, floa
     raise InputError(f"{source} has an invalid calibration; expected a slope above 0 and an offset for each class")
 
 
-def read_network_name(path: str | Path) -> str:
-    """Return the key in NETWORKS of a checkpoint's network.
-
-    Raises:
-        InputError: the file is not a checkpoint.
-    """
-    return _parse_header(_read(Path(path), tensors=False)[0], str(path))["network"]
-
-
 def save_checkpoint(path: str | Path, network: torch.nn.Module, header: Header, half: bool = False) -> None:
     """Write the weights and the header of a network atomically.
 
@@ -224,7 +215,7 @@ def read_header(path: str | Path, config_class: type[Config] | None = None) -> H
 
 
 def read_checkpoint(path: str | Path, config_class: type[Config]) -> tuple[Header, dict[str, torch.Tensor]]:
-    """Read the header and the tensors, on the CPU with the dtypes of the file.
+    """Read the header and the tensors as torch tensors on the CPU, with the dtypes of the file.
 
     Raises:
         InputError: see read_header.
@@ -234,7 +225,7 @@ def read_checkpoint(path: str | Path, config_class: type[Config]) -> tuple[Heade
 
 
 def read_arrays(path: str | Path, config_class: type[Config]) -> tuple[Header, dict[str, np.ndarray]]:
-    """Read the header and the tensors, with the dtypes of the file, without importing torch.
+    """Read the header and the tensors as NumPy arrays, with the dtypes of the file, without importing torch.
 
     Raises:
         InputError: see read_header.
@@ -302,23 +293,25 @@ def copy_matching_weights(network: torch.nn.Module, path: str | Path, config_cla
     """
     _, tensors = read_checkpoint(path, config_class)
     state = network.state_dict()
-    copied = 0
+    copied_count = 0
     for name, value in state.items():
-        stored = tensors.get(name)
-        if stored is None or stored.ndim != value.ndim:
+        stored_tensor = tensors.get(name)
+        if stored_tensor is None or stored_tensor.ndim != value.ndim:
             continue
-        if stored.shape == value.shape:
-            value.copy_(stored)
-        elif value.ndim > 1 and stored.shape[0] == value.shape[0] and (stored.shape[2:] == value.shape[2:]):
-            common = min(stored.shape[1], value.shape[1])
+        if stored_tensor.shape == value.shape:
+            value.copy_(stored_tensor)
+        elif (
+            value.ndim > 1 and stored_tensor.shape[0] == value.shape[0] and (stored_tensor.shape[2:] == value.shape[2:])
+        ):
+            common_inputs = min(stored_tensor.shape[1], value.shape[1])
             value.zero_()
-            value[:, :common] = stored[:, :common]
+            value[:, :common_inputs] = stored_tensor[:, :common_inputs]
         else:
             continue
-        copied += 1
-    if not copied:
+        copied_count += 1
+    if not copied_count:
         raise InputError(f"no layer in {path} matches the network to train")
-    return copied, len(state)
+    return copied_count, len(state)
 
 
 def require_same_config(config: Any, expected: Any, source: str) -> None:

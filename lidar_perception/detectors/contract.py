@@ -67,7 +67,7 @@ class Detector(Protocol):
 
 
 class CheckedInput(NamedTuple):
-    """Arguments of a detector after check_input().
+    """Checked and converted arguments of a detector.
 
     Attributes:
         frame: the usable points of the cloud, with intensity in 0..1.
@@ -96,8 +96,8 @@ def check_input(
     check_columns(len(frame), ground=ground, cluster_ids=cluster_ids)
     ground = None if ground is None else np.asarray(ground, bool)
     cluster_ids = None if cluster_ids is None else np.asarray(cluster_ids)
-    if frame is not cloud and not (usable := are_usable_returns(frame.xyz)).all():
-        indices = np.flatnonzero(usable)
+    if frame is not cloud and not (is_usable := are_usable_returns(frame.xyz)).all():
+        indices = np.flatnonzero(is_usable)
         frame = frame.take(indices)
         ground, cluster_ids = (column if column is None else column.take(indices) for column in (ground, cluster_ids))
     problem = find_scale_problem(frame.intensity) if use_intensity else None
@@ -111,5 +111,5 @@ def check_input(
 def join_problems(*problems: str | None) -> str | None:
     """Join messages in order, skipping those that a later one contains; None if there are none."""
     texts = [problem for problem in problems if problem]
-    unique = [text for i, text in enumerate(texts) if not any(text in later for later in texts[i + 1 :])]
-    return "; ".join(unique) or None
+    distinct_texts = [text for i, text in enumerate(texts) if not any(text in later for later in texts[i + 1 :])]
+    return "; ".join(distinct_texts) or None

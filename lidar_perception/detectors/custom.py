@@ -35,7 +35,7 @@ from lidar_perception.types import (
 
 ENTRY_POINTS = "lidar_perception.detectors"  # group of entry points: NAME = "module:Class"
 REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
-ARGUMENTS = "sensor_height", "device", "range"  # keyword arguments that are passed if the class accepts them
+ARGUMENTS = "sensor_height", "device", "range"  # keyword arguments passed to a class that accepts them
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,11 @@ class CustomDetectorParams:
 
 @dataclass
 class CustomDetector:
-    """Adapter that turns a function from a cloud to Detections into a contract.Detector.
+    """Adapter that makes a contract.Detector from a function that returns Detections for a cloud.
 
     Attributes:
         name: name of the detector in messages.
-        build: returns the detection function for a sensor height in metres.
+        build: function that returns the detection function for a sensor height in metres.
         classes: names of the detectable classes.
         params: parameter groups: crop, ground, and `group` with the score thresholds.
         group: name of the parameter group with the score thresholds.
@@ -163,8 +163,8 @@ def load_custom_detector(
 
     Args:
         reference: "module:Class". The module is on Python's path or in the current folder.
-        device, range: passed to the class if it has an argument of that name; so is the
-            sensor_height of `params`, in metres.
+        device, range: arguments for the class, passed if it accepts them; so is sensor_height, in
+            metres, from `params`.
         params, group: see CustomDetector. Default: CustomDetectorParams.
 
     Raises:

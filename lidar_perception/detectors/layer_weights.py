@@ -40,8 +40,8 @@ class LayerWeights:
 
         Args:
             shape: expected shape of the weight.
-            norm: name of the batch norm that follows the layer. If the file does not contain it, it
-                is already folded into the layer, which then has a bias.
+            norm: name of the batch norm that follows the layer. If the file has no such norm, it has
+                already been folded into the layer, which then has a bias.
 
         Raises:
             WeightsMismatch: the layer is missing or has a different shape.

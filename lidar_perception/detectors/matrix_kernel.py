@@ -20,14 +20,14 @@ from numba.extending import intrinsic
 def _find_vector_width() -> int:
     """Return the number of float32 values in a vector register of this processor.
 
-    0 if JIT compilation is disabled or the kernel has not been tested on this type of processor.
+    It is 0 if JIT compilation is disabled or the kernel is untested on this type of processor.
     """
     triple, _, features = cpu_target.target_context.codegen().magic_tuple()
-    enabled = features.split(",")
-    disabled = config.DISABLE_JIT  # type: ignore[attr-defined]  # numba sets it at run time
-    if disabled or not triple.startswith("x86_64") or "+fma" not in enabled:
+    enabled_features = features.split(",")
+    is_jit_disabled = config.DISABLE_JIT  # type: ignore[attr-defined]  # numba sets it at run time
+    if is_jit_disabled or not triple.startswith("x86_64") or "+fma" not in enabled_features:
         return 0
-    return 16 if "+avx512f" in enabled else 8 if "+avx2" in enabled else 0
+    return 16 if "+avx512f" in enabled_features else 8 if "+avx2" in enabled_features else 0
 
 
 LANES = _find_vector_width()
@@ -167,9 +167,9 @@ def pack_weights(weights: np.ndarray) -> np.ndarray:
     """Reorder weights (O, I, taps) for multiply_tile: (blocks, taps, channels, BLOCK) float32, padded with 0."""
     out, channels, taps = weights.shape
     blocks = -(-out // BLOCK)
-    padded = np.zeros((blocks * BLOCK, pad_channels(channels), taps), np.float32)
-    padded[:out, :channels] = weights
-    return np.ascontiguousarray(padded.reshape(blocks, BLOCK, -1, taps).transpose(0, 3, 2, 1))
+    padded_weights = np.zeros((blocks * BLOCK, pad_channels(channels), taps), np.float32)
+    padded_weights[:out, :channels] = weights
+    return np.ascontiguousarray(padded_weights.reshape(blocks, BLOCK, -1, taps).transpose(0, 3, 2, 1))
 
 
 def pad_channels(channels: int) -> int:
@@ -179,7 +179,7 @@ def pad_channels(channels: int) -> int:
 
 def pad_bias(bias: np.ndarray | None, width: int) -> np.ndarray:
     """Pad a bias (O,) with zeros to (width,) float32; None is all zeros."""
-    padded = np.zeros(width, np.float32)
+    padded_bias = np.zeros(width, np.float32)
     if bias is not None:
-        padded[: len(bias)] = bias
-    return padded
+        padded_bias[: len(bias)] = bias
+    return padded_bias

@@ -44,14 +44,14 @@ def rotated_nms(
     """
     order = np.argsort(-scores, kind="stable")
     group = np.zeros(len(order), np.int64) if across_classes else np.asarray(labels)[order]
-    ordered = np.asarray(boxes, np.float64).reshape(-1, 7)[order]
-    return order[_select_best(ordered, group, iou, np.argsort(ordered[:, 0]))]
+    sorted_boxes = np.asarray(boxes, np.float64).reshape(-1, 7)[order]
+    return order[_select_best(sorted_boxes, group, iou, np.argsort(sorted_boxes[:, 0]))]
 
 
 @njit(cache=True, nogil=True)
 def _select_best(boxes, group, iou, x_order):
     """Return a mask (N,) bool of the boxes that remain; boxes are sorted by score."""
-    keep = np.ones(len(boxes), np.bool_)
+    is_kept = np.ones(len(boxes), np.bool_)
     radii, corner_buffer = footprint_radii(boxes), np.empty((4, MAX_CORNERS))
     area = boxes[:, 3] * boxes[:, 4]
     x, max_radius = boxes[x_order, 0], 0.0
@@ -59,17 +59,17 @@ def _select_best(boxes, group, iou, x_order):
         if r > max_radius:  # False for NaN, the radius of boxes that overlap nothing
             max_radius = r
     for i in range(len(boxes)):
-        if not keep[i] or not radii[i] > 0:
+        if not is_kept[i] or not radii[i] > 0:
             continue
         max_distance = radii[i] + max_radius
         for position in range(lower_bound(x, boxes[i, 0] - max_distance), len(x)):
             if x[position] > boxes[i, 0] + max_distance:
                 break
             j = x_order[position]
-            if j > i and keep[j] and group[i] == group[j]:
+            if j > i and is_kept[j] and group[i] == group[j]:
                 overlap = overlap_area(boxes[i], boxes[j], radii[i] + radii[j], corner_buffer)
-                keep[j] = overlap <= 0 or overlap / (area[i] + area[j] - overlap) <= iou
-    return keep
+                is_kept[j] = overlap <= 0 or overlap / (area[i] + area[j] - overlap) <= iou
+    return is_kept
 
 
 @njit(cache=True, nogil=True)
@@ -79,10 +79,10 @@ def keep_first(is_duplicate):
     Args:
         is_duplicate: (N, N) bool; item j is dropped if is_duplicate[i, j] for a kept i < j.
     """
-    keep = np.ones(len(is_duplicate), np.bool_)
+    is_kept = np.ones(len(is_duplicate), np.bool_)
     for i in range(len(is_duplicate)):
-        if keep[i]:
+        if is_kept[i]:
             for j in range(i + 1, len(is_duplicate)):
                 if is_duplicate[i, j]:
-                    keep[j] = False
-    return keep
+                    is_kept[j] = False
+    return is_kept

@@ -52,7 +52,7 @@ class NormalizedView:
 
         Args:
             low, high: range of the view, low <= x y z < high; other points and points with NaN are
-                dropped. None: all points are kept.
+                dropped. None: keep all points.
             use_intensity: False sets the intensity to None. (Zeros would change the results of
                 Patchwork++, which removes dark points below the ground as reflections.)
         """
@@ -82,14 +82,13 @@ class NormalizedView:
         return replace(self, frame=replace(self.frame, xyz=xyz))
 
     def take(self, column: np.ndarray | None) -> np.ndarray | None:
-        """Return the values (M,) of this view from a column (N,) of the source; None for None."""
+        """Return the values (M,) of a column (N,) of the source at the points of this view; None for None."""
         return None if column is None else column.take(self.indices)
 
     def transfer(self, column: np.ndarray | None, other: NormalizedView) -> np.ndarray | None:
-        """Transfer a column (M,) of this view to another view of the same source with K points.
+        """Transfer a column (M,) of this view to the K points of another view of the same source.
 
-        Returns:
-            (K,) values, 0 for points that are not in this view; None for None.
+        Points that are not in this view get 0. The result is None if the column is None.
         """
         if column is None:
             return None
@@ -143,7 +142,7 @@ def crop_to_range(frame: PointCloud, low: Corner, high: Corner) -> tuple[np.ndar
 
 
 def segment_view_ground(frame: PointCloud, params: GroundParams) -> np.ndarray:
-    """Return the ground mask (M,) bool of a NormalizedView's frame; the pose in `params` is ignored."""
+    """Return the ground mask (M,) bool of a NormalizedView's frame, ignoring the pose in `params`."""
     return segment_ground(frame, replace(params, sensor_pose=SensorPoseParams()))
 
 
@@ -191,6 +190,6 @@ def rotate_half_turn(frame: PointCloud) -> PointCloud:
 
 def rotate_boxes_half_turn(boxes: np.ndarray) -> np.ndarray:
     """Return boxes (K, 7) rotated by 180 degrees about z."""
-    rotated = boxes * np.array([-1, -1, 1, 1, 1, 1, 1], boxes.dtype)
-    rotated[:, 6] = wrap_angle(rotated[:, 6] + np.pi)
-    return rotated
+    rotated_boxes = boxes * np.array([-1, -1, 1, 1, 1, 1, 1], boxes.dtype)
+    rotated_boxes[:, 6] = wrap_angle(rotated_boxes[:, 6] + np.pi)
+    return rotated_boxes

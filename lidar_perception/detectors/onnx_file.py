@@ -5,11 +5,10 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidar_perception.detectors.checkpoint import KEY, POINTPILLARS, Header
+from lidar_perception.detectors.checkpoint import KEY, Header
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.runs.threads import get_thread_count
 from lidar_perception.types import InputError
@@ -93,14 +92,7 @@ def open_session(path: str | Path) -> tuple[Any, str | None]:
 
 
 def run_session(session: Any, source: str, outputs: Sequence[str], inputs: Mapping[str, Any]) -> list[Any]:
-    """Run a session and return its outputs.
-
-    Args:
-        source: name of the file, for messages.
-
-    Raises:
-        InputError: the session fails.
-    """
+    """Run a session and return its outputs; raise an InputError that names the file `source` if it fails."""
     try:
         return session.run(list(outputs), dict(inputs))
     except Exception as error:  # ONNX Runtime's exceptions share no base class
@@ -114,13 +106,3 @@ def read_exported_header(path: Path) -> Header:
         InputError: see open_session, or the header is missing or invalid.
     """
     return Header.from_json(open_session(path)[1], str(path))
-
-
-def read_exported_name(path: Path) -> str:
-    """Return the key in checkpoint.NETWORKS of an exported network.
-
-    It is PointPillars if the header is invalid; the loader of PointPillars then reports the error.
-    """
-    with suppress(InputError):
-        return read_exported_header(path).network
-    return POINTPILLARS

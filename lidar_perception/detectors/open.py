@@ -1,4 +1,4 @@
-"""Opening of detectors, by name or from a file of weights. Importing this module does not import torch."""
+"""Opening of detectors by name or from a file of weights. Importing this module does not import torch."""
 
 from __future__ import annotations
 
@@ -38,8 +38,7 @@ PARAMS = {
     POINTNET: "pointnet.params.PointNetDetectorParams",
     FUSED: "fused.params.FusedDetectorParams",
 }
-ONNX = ".onnx"
-DETECTOR_BY_SUFFIX = {ONNX: POINTPILLARS, ".json": FUSED}  # suffixes of weight files that are not checkpoints
+CHECKPOINT_SUFFIX, ONNX_SUFFIX, FUSION_SUFFIX = ".safetensors", ".onnx", ".json"
 
 
 class ConfigurableDetector(Detector, Protocol):
@@ -70,9 +69,7 @@ def open_detector(
     reported on standard error.
 
     Args:
-        weights: name of a detector (fused, pointpillars or pointnet) with its shipped weights; or
-            a file: a checkpoint (.safetensors), an exported network (.onnx) or the output of
-            `train fused` (.json).
+        weights: name of a detector, or a file of weights, see api.load_detector.
         device: auto, cpu, cuda or cuda:N.
         sensor_height: height of the sensor above the ground in metres; None: 1.73 m, as in KITTI.
         min_score: score threshold of all classes, 0..1; None: the defaults.
@@ -154,17 +151,10 @@ def _get_module_name(path: str) -> str:
 
 
 def _apply_training_params(params: Any, path: Path | None) -> Any:
-    from lidar_perception.detectors.checkpoint import read_header
-    from lidar_perception.detectors.pointnet.config import PointNetConfig
     from lidar_perception.detectors.weights_file import find_pointnet_weights
 
     try:
-        if path is not None and path.suffix == ONNX:
-            from lidar_perception.detectors.onnx_file import read_exported_header
-
-            config = read_exported_header(path).config
-        else:
-            config = read_header(path or find_pointnet_weights(params.pointnet), PointNetConfig).config
+        config = _read_header(path or find_pointnet_weights(params.pointnet)).config
     except InputError:
         if path is not None:
             raise
@@ -188,20 +178,18 @@ def resolve_weights(weights: str | Path) -> tuple[str, Path | None]:
         return name, None
     if path.name == name and not path.suffix and not path.exists():
         raise make_unknown_name_error("detector or file of weights", name, [*LOAD, *entry_point_names()])
-    return _find_detector_name(path), path
+    return FUSED if path.suffix == FUSION_SUFFIX else _read_header(path).network, path
 
 
-def _find_detector_name(path: Path) -> str:
-    """Return the key in LOAD for a file of weights; raise InputError if the file is invalid."""
-    if path.suffix == ONNX and path.is_file():
-        from lidar_perception.detectors.onnx_file import read_exported_name
+def _read_header(path: Path) -> Header:
+    """Read the header of a checkpoint or an exported network."""
+    if path.suffix == ONNX_SUFFIX:
+        from lidar_perception.detectors.onnx_file import read_exported_header
 
-        return read_exported_name(path)
-    if path.suffix in DETECTOR_BY_SUFFIX:
-        return DETECTOR_BY_SUFFIX[path.suffix]
-    from lidar_perception.detectors.checkpoint import read_network_name
+        return read_exported_header(path)
+    from lidar_perception.detectors.checkpoint import read_header
 
-    return read_network_name(path)
+    return read_header(path)
 
 
 def check_weights(path: Path, height: float) -> list[str]:
@@ -210,27 +198,17 @@ def check_weights(path: Path, height: float) -> list[str]:
     The warnings concern a different sensor height in training, uncalibrated scores, and classes
     that are never detected. Exported networks are not checked.
     """
-    if DETECTOR_BY_SUFFIX.get(path.suffix) == FUSED:
+    if path.suffix == FUSION_SUFFIX:
         from lidar_perception.detectors.fused.fusion import read_fusion
 
         fusion = read_fusion(path)
-        header = _read_header(fusion.proposer)
         return [
-            *fusion.find_warnings(header.config.classes if header else ()),
+            *fusion.find_warnings(_read_header(fusion.proposer).config.classes),
             *check_weights(fusion.proposer, height),
             *check_weights(fusion.classifier, height),
         ]
-    header = _read_header(path)
-    mismatch = header.find_height_mismatch(height) if header else None
+    mismatch = _read_header(path).find_height_mismatch(height) if path.suffix == CHECKPOINT_SUFFIX else None
     return [f"{path}: {mismatch}"] if mismatch else []
-
-
-def _read_header(path: Path) -> Header | None:
-    if path.suffix != ".safetensors":
-        return None
-    from lidar_perception.detectors.checkpoint import read_header
-
-    return read_header(path)
 
 
 @dataclass(frozen=True)

@@ -61,9 +61,8 @@ def make_range_param() -> Any:
     """Return the parameter `range` of detectors with PointPillars."""
     return param(
         "auto",
-        "Covered area. ahead: 69.12 m ahead and 39.68 m to each side; around: "
-        "51.2 m in all directions (a network trained ahead runs twice per cloud); auto: "
-        "the area that the weights were trained for.",
+        "Covered area. ahead: 69.12 m ahead and 39.68 m to each side; around: 51.2 m in all directions (a network "
+        "trained for `ahead` runs twice per cloud); auto: the area that the weights were trained for.",
         choices=RANGE_CHOICES,
         fixed=True,
     )
@@ -73,26 +72,23 @@ def make_amp_param() -> Any:
     """Return the parameter `amp` of detectors with PointPillars."""
     return param(
         "off",
-        "Number format of PointPillars' layers. off: float32. auto: 16 bits (bf16, "
-        "on older GPUs fp16) if the device has instructions for it: half the time, "
-        "slightly different scores. bf16: on every device.",
+        "Number format of PointPillars' layers. off: float32. auto: 16 bits (bf16, on older GPUs fp16) if the device "
+        "has instructions for it: half the time, slightly different scores. bf16: on every device.",
         choices=("off", "auto", "bf16"),
         fixed=True,
     )
 
 
-def make_engine_param(more: str = "") -> Any:
+def make_engine_param(other_networks: str = "") -> Any:
     """Return the parameter `engine` of detectors with PointPillars.
 
-    Args:
-        more: text about other networks of the detector, appended to the description.
+    The description ends with `other_networks`, a text about other networks of the detector.
     """
     return param(
         "auto",
-        "Implementation of PointPillars' layers on the CPU. sparse: kernels that "
-        "compute only cells near points; needs a version without ground (v1, v2, v4), "
-        "x86-64 with AVX2, and amp off. torch: all cells. auto: sparse if possible. "
-        "Detections are the same." + more,
+        "Implementation of PointPillars' layers on the CPU. sparse: kernels that compute only cells near points; needs "
+        "a version without ground (v1, v2, v4), x86-64 with AVX2, and amp off. torch: all cells. auto: sparse if "
+        "possible. Detections are the same." + other_networks,
         choices=("auto", "torch", "sparse"),
         fixed=True,
     )
@@ -126,9 +122,7 @@ class NetworkParams(Params):
     )
     warm_up: bool = param(True, "Run once on synthetic points before the first cloud.", fixed=True)
     use_intensity: bool = param(
-        True,
-        "Use the intensity. It is normalized, so that gain and scale "
-        "of the sensor have no effect. false: leave it out.",
+        True, "Use the intensity, normalized so that gain and scale of the sensor have no effect. false: ignore it."
     )
     scores: ScoreParams = ScoreParams()
     nms: NmsParams = NmsParams()

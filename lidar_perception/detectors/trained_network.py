@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from lidar_perception.detectors.calibration import to_raw_score
 from lidar_perception.detectors.checkpoint import Header
@@ -15,12 +15,6 @@ from lidar_perception.detectors.devices import CPU, is_out_of_memory
 from lidar_perception.types import InputError
 
 Result = TypeVar("Result")
-
-
-class Movable(Protocol):
-    """A network that can be moved to another device."""
-
-    def to(self, device: str) -> Any: ...
 
 
 @dataclass
@@ -36,9 +30,13 @@ class Placement:
 
 
 class TrainedNetwork:
-    """A network in inference mode with its header and device."""
+    """A network in inference mode with its header and device.
 
-    def __init__(self, network: Movable, header: Header, device: str = CPU):
+    Args:
+        network: network with a method to(device), see the Protocol of each type of network.
+    """
+
+    def __init__(self, network: Any, header: Header, device: str = CPU):
         self.network, self.header = network, header
         self.placement = Placement(device)
 
@@ -58,11 +56,8 @@ class TrainedNetwork:
 
     def with_raw_scores(self) -> Self:
         """Return a copy that reports uncalibrated scores."""
-        return self._with_header(replace(self.header, calibration={}))
-
-    def _with_header(self, header: Header) -> Self:
         other = copy.copy(self)
-        other.header = header
+        other.header = replace(self.header, calibration={})
         return other
 
     def to_raw_scores(self, scores: Mapping[str, float]) -> list[float]:

@@ -20,8 +20,8 @@ from lidar_perception.ground.params import ClothParams
 
 GRID_LEVELS = 6  # number of grids of the solver, each twice as coarse as the previous one
 TOLERANCE_M = 0.001  # maximum movement of a particle in the last step
-SUNK_WINDOWS = (2, 6)  # half widths, in cells, of the windows in which a cell is compared with its neighbours
-SUNK_DEPTH_M = 0.4  # minimum depth of a reflection below its surroundings
+REFLECTION_WINDOWS = (2, 6)  # half widths, in cells, of the windows in which a cell is compared with its neighbours
+REFLECTION_DEPTH_M = 0.4  # minimum depth of a reflection below its surroundings
 
 
 class Cloth(NamedTuple):
@@ -31,8 +31,7 @@ class Cloth(NamedTuple):
 
     Attributes:
         height: (R, C) float32 height of each particle, in metres.
-        x0: x of the first column, in metres.
-        y0: y of the first row, in metres.
+        x0, y0: x of the first column and y of the first row, in metres.
         resolution: distance between neighbouring particles, in metres.
         lowest: (R, C) float32 height of the lowest point in the cell around each particle, inf for
             cells without points.
@@ -76,7 +75,7 @@ def segment_by_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()) -> np
 
 def lay_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()) -> Cloth | None:
     """Compute the cloth at rest under points (N, 3); return None if no point is within max_range."""
-    # Cells start at multiples of the coarsest size, so that a far point adds cells but moves none.
+    # Cells start at multiples of the coarsest size, so that a distant point adds cells but moves none.
     block = 2 ** (GRID_LEVELS - 1)
     low_x, low_y, high_x, high_y = _find_bounds(xyz, params.max_range)
     if low_x > high_x:
@@ -86,7 +85,7 @@ def lay_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()) -> Cloth | N
     columns, rows = ((np.floor([high_x / block_size, high_y / block_size]) - first_block + 1) * block).astype(int)
     x0, y0 = first_block * block_size
     lowest = _find_lowest_points(xyz, params.max_range, x0, y0, 1.0 / params.resolution, rows, columns)
-    _drop_sunk_cells(lowest, SUNK_DEPTH_M)
+    _drop_reflections(lowest, REFLECTION_DEPTH_M)
     lift = params.curvature * params.resolution**2 / 4
     half_cell = params.resolution / 2
     height = settle_sheet(lowest, lift, TOLERANCE_M, GRID_LEVELS)
@@ -119,20 +118,20 @@ def _find_lowest_points(xyz, max_range, x0, y0, scale, rows, columns):
 
 
 @njit(cache=True, nogil=True)
-def _drop_sunk_cells(lowest, depth):
+def _drop_reflections(lowest, depth):
     """Mark cells with reflections below the ground as UNOBSERVED.
 
-    A cell is dropped if its lowest point is more than `depth` below the lowest points of all
-    neighbouring cells except at most one. It would pull the cloth down for metres around it. The
-    wider window is for large ranges, where few neighbouring cells have points.
+    A cell is dropped if its lowest point is more than `depth` metres below the lowest points of all
+    neighbouring cells except at most one. Such a point would pull the cloth down for metres around
+    it. The wider window is for large ranges, where few neighbouring cells have points.
     """
     rows, columns = lowest.shape
-    sunk_cells = []
+    reflections = []
     for r in range(rows):
         for c in range(columns):
             if lowest[r, c] == UNOBSERVED:
                 continue
-            for reach in SUNK_WINDOWS:
+            for reach in REFLECTION_WINDOWS:
                 higher_count = level_count = 0
                 for i in range(max(r - reach, 0), min(r + reach + 1, rows)):
                     for j in range(max(c - reach, 0), min(c + reach + 1, columns)):
@@ -146,27 +145,19 @@ def _drop_sunk_cells(lowest, depth):
                 if level_count > 2:
                     break
                 if higher_count >= 4:  # all neighbours except at most one
-                    sunk_cells.append((r, c))
+                    reflections.append((r, c))
                     break
-    for r, c in sunk_cells:
+    for r, c in reflections:
         lowest[r, c] = UNOBSERVED
 
 
 @njit(cache=True, nogil=True)
 def _select_near_cloth(xyz, height, climbing_height, x0, y0, scale, max_range, threshold):
-    """Select the points within max_range that are close to the cloth or to ground that climbs.
+    """Select the points within max_range that are close to the cloth or to ground that climbs, (N,) bool.
 
-    The height of the cloth is interpolated bilinearly.
-
-    Args:
-        height: (R, C) height of the cloth in metres.
-        climbing_height: (R, C) height of the lowest point of cells that continue the ground
-            uphill, -inf for other cells.
-        threshold: maximum distance from the cloth along z and maximum height above
-            climbing_height, in metres.
-
-    Returns:
-        (N,) bool, True = ground.
+    The height (R, C) of the cloth is interpolated bilinearly. climbing_height (R, C) is the height
+    of the lowest point of cells that continue the ground uphill, -inf for other cells. `threshold`
+    is the maximum distance from the cloth along z and the maximum height above climbing_height.
     """
     rows, columns = height.shape
     is_ground = np.zeros(len(xyz), np.bool_)

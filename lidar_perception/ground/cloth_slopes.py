@@ -37,7 +37,7 @@ def find_climbing_cells(lowest, height, threshold, slope):
         slope: rise per cell in metres.
 
     Returns:
-        (R, C) bool: True for these cells, False for all others, including those that the cloth touches.
+        (R, C) bool, True for these cells; False for cells that the cloth touches.
     """
     rows, columns = lowest.shape
     is_ground, is_climbing = np.zeros(lowest.shape, np.bool_), np.zeros(lowest.shape, np.bool_)

@@ -1,4 +1,4 @@
-"""Multigrid solver of the obstacle problem: a loaded sheet at rest under obstacles.
+"""Multigrid solver for the obstacle problem: a loaded sheet at rest under obstacles.
 
 Each height of a grid (R, C) obeys height <= obstacle. It either touches its obstacle or equals the
 mean of its four neighbours plus its lift. Beyond the border, the sheet is level. A smoothing pass
@@ -52,10 +52,7 @@ def settle_sheet(obstacle: np.ndarray, lift: float, tolerance: float, levels: in
 
 
 def _run_cycle(sheet: np.ndarray, obstacle: np.ndarray, lift: np.ndarray, coarser_levels: int) -> float:
-    """Run one V-cycle in place; return the largest movement of the last sweep, in metres.
-
-    coarser_levels is the number of coarser grids.
-    """
+    """Run one V-cycle in place; return the largest movement in the last sweep, in metres."""
     if coarser_levels == 0:
         return _smooth(sheet, obstacle, lift, COARSEST_SWEEPS, np.float32(RELAXATION))
     _smooth(sheet, obstacle, lift, SWEEPS, np.float32(1.0))

@@ -18,8 +18,8 @@ class SensorPoseParams(Params):
 
     height: float = param(
         SENSOR_HEIGHT,
-        "Height of the sensor above the ground. It is compared "
-        "with the first clouds; a warning reports the measured height.",
+        "Height of the sensor above the ground. If the height measured in the first clouds differs, a warning reports "
+        "it.",
         unit="m",
         low=0.0,
         high=50.0,
@@ -46,9 +46,8 @@ class ThresholdParams(Params):
 
     max_height: float = param(
         0.43,
-        "Maximum height, above the ground at the sensor, of the points to which "
-        "the plane is fitted. For a sensor at 1.73 m, 0.43 m is the paper's "
-        "z < -1.3.",
+        "Maximum height, above the ground at the sensor, of the points to which the plane is fitted. For a sensor at "
+        "1.73 m, 0.43 m is the paper's z < -1.3.",
         unit="m",
         low=-10.0,
         high=100.0,
@@ -126,9 +125,8 @@ class ClothParams(Params):
     def check(self) -> None:
         if (cells := (2 * self.max_range / self.resolution) ** 2) > 4_000_000:
             raise ValueError(
-                f"resolution = {self.resolution} m and max_range = {self.max_range} "
-                f"m need {cells:.0f} particles, more than the maximum of 4 million; "
-                "increase resolution or decrease max_range"
+                f"resolution = {self.resolution} m and max_range = {self.max_range} m need {cells:.0f} particles, more "
+                "than the maximum of 4 million; increase resolution or decrease max_range"
             )
 
 
@@ -141,9 +139,8 @@ class GroundParams(Params):
 
     method: str = param(
         "threshold",
-        "threshold: one plane (STM-CPA paper). patchwork: "
-        "Patchwork++ (EG-PointPillars paper). cloth: cloth simulation "
-        "(improved-PointNet paper).",
+        "threshold: one plane (STM-CPA paper). patchwork: Patchwork++ (EG-PointPillars paper). cloth: cloth "
+        "simulation (improved-PointNet paper).",
         choices=GROUND_METHODS,
     )
     sensor_pose: SensorPoseParams = SensorPoseParams()
@@ -165,8 +162,8 @@ class ObstacleParams(Params):
     )
     max_height: float = param(
         0.0,
-        "Maximum height of obstacles above the ground around them, so "
-        "that a robot passes under branches and bridges; 0: no limit.",
+        "Maximum height of obstacles above the ground around them, so that a robot passes under branches and bridges; "
+        "0: no limit.",
         unit="m",
         low=0.0,
         high=100.0,

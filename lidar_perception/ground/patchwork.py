@@ -236,7 +236,7 @@ def _fit_plane(points, state, size, plane):
             sx, sy, sz = sx + points[0, i], sy + points[1, i], sz + points[2, i]
     if count == 0:
         return
-    # Rounded to float32 as in the library, which decides about planes through two points.
+    # Rounded to float32 as in the library, because the rounding determines the plane through two points.
     mean = np.array([sx / count, sy / count, sz / count], np.float32)
     xx, xy, yy, xz, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(size):
@@ -288,7 +288,7 @@ def _decompose(matrix, plane):
         _find_kernel(m, low, normal, column)
     else:
         _find_kernel(m, high, column, normal)
-        if middle - low <= 0:  # the column found is close to the eigenvector
+        if middle - low <= 0:  # `normal` holds a column that is close to the eigenvector
             factor = np.float32(1.0) - (column[0] * normal[0] + column[1] * normal[1] + column[2] * normal[2])
             length = np.float32(0.0)
             for k in range(3):

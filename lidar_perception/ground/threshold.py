@@ -80,12 +80,12 @@ def refine_plane(xyz: np.ndarray, plane: np.ndarray, params: ThresholdParams) ->
     """
     max_gradient = np.tan(np.radians(params.max_slope))
     for _ in range(MAX_REFINEMENTS):
-        fitted = _solve_plane(_compute_moments(xyz, plane, params.inlier_distance))
-        if fitted is None:
+        fitted_plane = _solve_plane(_compute_moments(xyz, plane, params.inlier_distance))
+        if fitted_plane is None:
             return None
-        if np.array_equal(fitted, plane) or np.hypot(fitted[0], fitted[1]) > max_gradient:
+        if np.array_equal(fitted_plane, plane) or np.hypot(fitted_plane[0], fitted_plane[1]) > max_gradient:
             break
-        plane = fitted
+        plane = fitted_plane
     return plane
 
 

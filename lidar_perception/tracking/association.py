@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from lidar_perception.geometry import MAX_CORNERS, footprint_radii, lower_bound, overlap_area
 from lidar_perception.tracking.params import NOMINAL_PERIOD_S, AssociationParams
@@ -55,7 +57,6 @@ def find_pairs(
         min_gates: (N,) minimum gate radii, metres.
         boxes: (M, 7) detected boxes in the same frame as the tracks.
         box_models: (M,) motion models of the detections, indices into MOTION_MODELS.
-        params: Parameters of the assignment.
         seconds: Time since the previous frame.
     """
     max_gate = params.max_gate * max(1.0, seconds / NOMINAL_PERIOD_S)
@@ -70,21 +71,16 @@ def find_pairs(
     is_other_model = models[i] != box_models[j]
     are_both_persons = (models[i] > 0) & (box_models[j] > 0)
     costs += params.other_kind * is_other_model * np.where(are_both_persons, 0.5, 1.0)
-    allowed = np.flatnonzero(costs <= MAX_COST)
-    return Pairs(i, j, costs).select(allowed[np.lexsort((j[allowed], i[allowed]))])
+    allowed_pairs = np.flatnonzero(costs <= MAX_COST)
+    return Pairs(i, j, costs).select(allowed_pairs[np.lexsort((j[allowed_pairs], i[allowed_pairs]))])
 
 
 @njit(cache=True, nogil=True)
 def _find_pairs_in_gates(tracks, gates, boxes, order, with_iou):
-    """Find the pairs of tracks (N, 7) and boxes (M, 7) within the gates.
+    """Find the pairs of tracks (N, 7) and boxes (M, 7) within the gates, whose radii are gates (N,).
 
-    Args:
-        gates: (N,) radii of the gates, metres.
-        order: (M,) indices that sort the boxes by x.
-        with_iou: True to compute the IoU.
-
-    Returns:
-        Track, box, distance of the centres, and BEV IoU (0 without with_iou) of each pair, (P,).
+    `order` (M,) sorts the boxes by x. Returns the track, the box, the distance of the centres, and
+    the BEV IoU (0 without with_iou) of each pair, (P,).
     """
     x = boxes[order, 0]
     track_radii, box_radii = footprint_radii(tracks), footprint_radii(boxes)
@@ -116,44 +112,24 @@ def assign(pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
 
     Returns the indices of the tracks (P,), ascending, and of their detections (P,).
     """
-    components = _label_components(pairs.tracks, pairs.boxes)
+    components = _label_components(pairs)
     is_single = np.bincount(components)[components] == 1
-    selected_parts = [np.flatnonzero(is_single)]
-    remaining = np.flatnonzero(~is_single)
-    remaining = remaining[np.argsort(components[remaining], kind="stable")]
-    for group in np.split(remaining, np.flatnonzero(np.diff(components[remaining])) + 1):
+    parts = [np.flatnonzero(is_single)]
+    conflicting_pairs = np.flatnonzero(~is_single)
+    conflicting_pairs = conflicting_pairs[np.argsort(components[conflicting_pairs], kind="stable")]
+    for group in np.split(conflicting_pairs, np.flatnonzero(np.diff(components[conflicting_pairs])) + 1):
         if len(group):
-            selected_parts.append(group[_assign_component(pairs.select(group))])
-    selected = np.sort(np.concatenate(selected_parts))
-    return pairs.tracks[selected], pairs.boxes[selected]
+            parts.append(group[_assign_component(pairs.select(group))])
+    assigned_pairs = np.sort(np.concatenate(parts))
+    return pairs.tracks[assigned_pairs], pairs.boxes[assigned_pairs]
 
 
-@njit(cache=True, nogil=True)
-def _label_components(tracks, boxes):
-    """Label the connected components of pairs; pairs with a common track or box are connected.
-
-    Returns:
-        (P,) int64 label of each pair: the smallest index of a pair in its component.
-    """
-    parent = np.arange(len(tracks))
-    for nodes in (tracks, boxes):
-        first_pair = np.full(nodes.max() + 1 if len(nodes) else 0, -1)  # first pair of each node
-        for pair in range(len(nodes)):
-            if first_pair[nodes[pair]] < 0:
-                first_pair[nodes[pair]] = pair
-            root, other_root = _find_root(parent, first_pair[nodes[pair]]), _find_root(parent, pair)
-            parent[max(root, other_root)] = min(root, other_root)
-    for pair in range(len(tracks)):
-        parent[pair] = _find_root(parent, pair)
-    return parent
-
-
-@njit(cache=True, nogil=True)
-def _find_root(parent, node):
-    while parent[node] != node:
-        parent[node] = parent[parent[node]]
-        node = parent[node]
-    return node
+def _label_components(pairs: Pairs) -> np.ndarray:
+    """Label the connected components (P,) of pairs; pairs with a common track or box are connected."""
+    first_box = pairs.tracks.max(initial=-1) + 1
+    count = first_box + pairs.boxes.max(initial=-1) + 1
+    graph = coo_array((np.ones(len(pairs.tracks)), (pairs.tracks, first_box + pairs.boxes)), shape=(count, count))
+    return connected_components(graph, directed=False)[1][pairs.tracks]
 
 
 def _assign_component(pairs: Pairs) -> np.ndarray:

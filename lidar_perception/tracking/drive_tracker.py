@@ -24,17 +24,15 @@ class DriveTracker:
     """Tracker for the detections of a recording: tracker(frame, detections) -> Tracks.
 
     Call it for each frame in order of time. All tracks end when a new drive begins: at a new
-    sequence, or, in a recording without sequences such as a bag, at a jump of the stamps (see
-    data.frame). Ids are unique in the whole recording.
+    sequence or, if the recording has no sequences (as a bag), at a jump of the stamps, see
+    data.frame. Track ids are unique within the recording.
 
     Args:
-        recording: Recording with the frames.
-        params: Parameters of the tracker.
         ego: Source of the poses, one of RECORDED_EGO; see choose_ego_source. kiss_icp loads every
             frame.
 
     Attributes:
-        drive: Name of the last frame's drive.
+        drive: Name of the drive that the last frame belongs to.
         has_pose: True if the last frame had a pose, or if ego is "none".
     """
 

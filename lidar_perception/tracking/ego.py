@@ -33,7 +33,7 @@ class Ego:
         pose: (4, 4) current pose, extrapolated if no pose was measured.
         velocity: (3,) m/s in the sensor's frame, from the last two measured poses.
         rotation: (3,) angular velocity as a rotation vector, rad/s, from the same two poses.
-        missing_s: Time since the last measured pose.
+        missing_s: Time since the last measured pose, in seconds.
         has_pose: True after the first measured pose.
     """
 
@@ -60,20 +60,20 @@ def is_valid_pose(pose: np.ndarray | None) -> bool:
 def advance_ego(ego: Ego, pose: np.ndarray | None, seconds: float, max_gap: float) -> Ego:
     """Return the motion state `seconds` later, given the pose measured at that time.
 
-    If the pose is missing (None), the sensor is assumed to keep its velocity for max_gap seconds
-    and then to stop.
+    If the pose is missing (None), the sensor is assumed to keep its velocity until max_gap seconds
+    after the last measured pose, and then to stop.
     """
     if pose is not None:
         pose = np.asarray(pose, np.float64)
         elapsed_s = seconds + ego.missing_s
         if not ego.has_pose or elapsed_s <= 0:
             return Ego(pose, ego.velocity, ego.rotation, 0.0, True)
-        start = ego.pose @ np.linalg.inv(_compute_step(ego, min(ego.missing_s, max_gap)))
-        step = np.linalg.inv(start) @ pose
+        measured_pose = ego.pose @ np.linalg.inv(_compute_step(ego, min(ego.missing_s, max_gap)))
+        step = np.linalg.inv(measured_pose) @ pose
         return Ego(pose, step[:3, 3] / elapsed_s, Rotation.from_matrix(step[:3, :3]).as_rotvec() / elapsed_s, 0.0, True)
-    moving_s = max(min(seconds, max_gap - ego.missing_s), 0.0)
+    motion_s = max(min(seconds, max_gap - ego.missing_s), 0.0)
     return Ego(
-        ego.pose @ _compute_step(ego, moving_s), ego.velocity, ego.rotation, ego.missing_s + seconds, ego.has_pose
+        ego.pose @ _compute_step(ego, motion_s), ego.velocity, ego.rotation, ego.missing_s + seconds, ego.has_pose
     )
 
 
@@ -98,22 +98,15 @@ def choose_source(requested: str, available: Collection[str]) -> str:
     return next((name for name in SOURCES if name in available and requested in ("auto", name)), NO_SOURCE)
 
 
-def choose_recorded_source(has_poses: bool, requested: str = "auto") -> str:
-    """Choose the source of poses for recorded frames.
-
-    A source other than "auto" is returned unchanged, even if it is not available.
-
-    Args:
-        has_poses: True if the recording has poses.
-        requested: Name of a source, or "auto".
-    """
-    return choose_source(requested, {requested, *["recording"] * has_poses, *["kiss_icp"] * has_odometry()})
+def choose_recorded_source(has_poses: bool) -> str:
+    """Choose the best source of poses for frames of a recording that has poses or not."""
+    return choose_source("auto", [*["recording"] * has_poses, *["kiss_icp"] * has_odometry()])
 
 
 def make_pose_reader(source: str) -> Callable[[Frame], np.ndarray | None]:
-    """Return a function that returns the pose (4, 4) of a frame, or None.
+    """Return a function that maps a frame to its pose (4, 4), or to None if it has no pose.
 
-    Call it for the frames of a drive in order. With KISS-ICP, it loads each frame.
+    Call the function for the frames of a drive in order. With KISS-ICP, it loads each frame.
 
     Raises:
         InputError: The source is kiss_icp, which is not installed.

@@ -47,7 +47,6 @@ def compute_validity(
         evidence: (N,) sum of the evidence.
         count: (N,) number of observations.
         moving: (N,) probability of motion; values above 0.5 are evidence for an object.
-        params: Parameters of the existence model.
     """
     mean_evidence = evidence / np.maximum(count, 1e-9)
     return (
@@ -68,7 +67,6 @@ def compute_miss_penalty(hits: np.ndarray, tries: np.ndarray, seconds: float, pa
         hits: (N,) number of hits.
         tries: (N,) number of frames.
         seconds: Time since the previous frame.
-        params: Parameters of the existence model.
     """
     rate = np.minimum((hits + PRIOR_HITS) / (tries + PRIOR_TRIES), MAX_HIT_RATE)
     return np.minimum(-np.log(1.0 - rate), params.max_absence * (seconds / NOMINAL_PERIOD_S))

@@ -13,7 +13,7 @@ import numpy as np
 from lidar_perception.geometry import wrap_angle, wrap_line
 
 X, Y, VX, VY, HEADING, TURN_RATE = range(6)
-MEASURED = np.array([X, Y, HEADING])  # measured elements of the state
+MEASURED_INDICES = np.array([X, Y, HEADING])  # elements of the state that are measured
 MIN_OPPOSING_SCORE = 1.0  # sum of the scores of opposite headings at which a heading is reversed
 MIN_TURN_RAD = 1e-4  # rotation per step below which sin(a) / a is computed as a series
 
@@ -79,10 +79,10 @@ def update(
         measurements: (N, 3) [x y heading].
         noise: (N, 3) standard deviations of the measurements.
     """
-    innovation = measurements - means[:, MEASURED]
+    innovation = measurements - means[:, MEASURED_INDICES]
     innovation[:, 2] = wrap_line(innovation[:, 2])
-    cross_covariances = covariances[:, :, MEASURED]
-    innovation_covariances = cross_covariances[:, MEASURED]
+    cross_covariances = covariances[:, :, MEASURED_INDICES]
+    innovation_covariances = cross_covariances[:, MEASURED_INDICES]
     innovation_covariances[:, range(3), range(3)] += noise * noise
     gain = np.linalg.solve(innovation_covariances, cross_covariances.transpose(0, 2, 1)).transpose(0, 2, 1)
     return _normalize(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from lidar_perception.classes import TABLE
 from lidar_perception.param_fields import Params, param
 
-MOTION_MODELS = ("vehicle", "pedestrian", "cyclist")  # names of the motion models
+MOTION_MODELS = ("vehicle", "pedestrian", "cyclist")
 MODEL_BY_CLASS_ID = tuple(MOTION_MODELS.index(row.motion_model) for row in TABLE)
 
 NOMINAL_PERIOD_S = 0.1  # time between frames for which max_gate and max_absence are given
@@ -15,7 +15,7 @@ NOMINAL_PERIOD_S = 0.1  # time between frames for which max_gate and max_absence
 
 @dataclass(frozen=True)
 class MotionParams(Params):
-    """Noise of the motion and of the measurements of one motion model."""
+    """Parameters of a motion model: noise of the motion and of the measurements."""
 
     acceleration: float = param(2.0, "Noise density of random acceleration.", unit="m/s^1.5", low=0.01, high=100.0)
     turning: float = param(
@@ -49,13 +49,12 @@ class MotionParams(Params):
 
 @dataclass(frozen=True)
 class AssociationParams(Params):
-    """Assignment of detections to tracks."""
+    """Parameters of the assignment of detections to tracks."""
 
     overlap: float = param(
         0.5,
-        "Weight of 1 - BEV IoU in the cost; the distance of the centres, "
-        "divided by the gate, has the remaining weight. 0: distance "
-        "only, 1: overlap only.",
+        "Weight of 1 - BEV IoU in the cost; the distance of the centres, divided by the gate radius, has the "
+        "remaining weight. 0: distance only, 1: overlap only.",
         low=0.0,
         high=1.0,
     )
@@ -74,8 +73,8 @@ class AssociationParams(Params):
     )
     strong: float = param(
         0.2,
-        "Minimum score of detections that are matched first and can start "
-        "tracks. Detections with lower scores only continue unmatched tracks.",
+        "Minimum score of detections that are matched first and can start tracks. Detections with lower scores only "
+        "continue unmatched tracks.",
         low=0.0,
         high=1.0,
     )
@@ -105,15 +104,17 @@ class ExistenceParams(Params):
         low=0.0,
         high=1.0,
     )
-    memory: float = param(1.0, "Time constant with which evidence fades.", unit="s", low=0.05, high=1000.0)
+    memory: float = param(1.0, "Time constant of the decay of the evidence.", unit="s", low=0.05, high=1000.0)
     prior: float = param(0.0, "Log odds of a track before any evidence.", low=-10.0, high=10.0)
-    missed: float = param(-1.5, "Evidence of a frame without a detection of the track.", low=-10.0, high=0.0)
-    moves: float = param(1.0, "Evidence of motion, used only with poses.", low=0.0, high=10.0)
+    missed: float = param(-1.5, "Evidence added for a frame without a detection of the track.", low=-10.0, high=0.0)
+    moves: float = param(
+        1.0, "Evidence added for motion; used only if the poses of the sensor are known.", low=0.0, high=10.0
+    )
     walking: float = param(3.0, "Maximum speed of a pedestrian.", unit="m/s", low=0.5, high=100.0)
     faster: float = param(
         3.0,
         "Evidence against a pedestrian that is faster than `walking`, because cyclists can look like pedestrians; "
-        "used only with poses.",
+        "used only if the poses of the sensor are known.",
         low=0.0,
         high=20.0,
     )
@@ -121,8 +122,8 @@ class ExistenceParams(Params):
     max_present: float = param(3.0, "Upper limit of the log odds of presence.", low=0.0, high=20.0)
     max_absence: float = param(
         0.4,
-        "Maximum decrease of the log odds of presence per 0.1 s without a detection; low, because occlusions last "
-        "for a while.",
+        "Maximum decrease of the log odds of presence per 0.1 s without a detection. It is low because occlusions "
+        "last for a while.",
         low=0.01,
         high=10.0,
     )
@@ -146,7 +147,7 @@ class TrackingParams(Params):
         high=1.0,
     )
     overlap: float = param(
-        0.3, "If two tracks have a BEV IoU above this, the less probable one ends.", low=0.0, high=1.0
+        0.3, "If the BEV IoU of two tracks is above this, the less probable one is removed.", low=0.0, high=1.0
     )
     moving_speed: float = param(0.5, "Minimum speed of a moving track.", unit="m/s", low=0.0, high=10.0)
     min_score: float = param(0.05, "Detections with a lower score are ignored.", low=0.0, high=1.0)
@@ -191,9 +192,8 @@ class EgoParams(Params):
     )
     max_gap: float = param(
         0.5,
-        "Maximum gap between poses that is interpolated, and maximum "
-        "time of extrapolation after the last pose; after that, the "
-        "tracker applies max_ego_gap.",
+        "Maximum gap between poses that is interpolated, and maximum time of extrapolation after the last pose; after "
+        "that, the tracker applies max_ego_gap.",
         unit="s",
         low=0.0,
         high=100.0,

@@ -71,7 +71,7 @@ class States:
 
     @staticmethod
     def none() -> States:
-        """Return states of zero tracks."""
+        """Return the states of no tracks, with empty arrays."""
         shapes = {"means": (6,), "covariances": (6, 6), "sizes": (3,), "class_evidence": (len(CLASSES),)}
         dtypes = {"ids": np.int64, "class_ids": np.int32}
         return States(*(np.zeros((0, *shapes.get(f.name, ())), dtypes.get(f.name, np.float64)) for f in fields(States)))

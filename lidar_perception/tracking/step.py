@@ -93,12 +93,11 @@ def update(
     """Update the tracks with the detections of a frame.
 
     Args:
-        states: State of N tracks, predicted to this frame.
+        states: States of N tracks, predicted to the time of this frame.
         i: (P,) indices of the tracks with a detection; the other tracks have a miss.
         boxes: (P, 7) detected boxes.
         class_ids: (P,) classes of the detections.
         scores: (P,) scores of the detections.
-        params: Parameters of the tracker.
         is_fixed: True if the frame is fixed to the ground. Only then are objects assumed to move
             along their heading.
         seconds: Time since the previous frame.
@@ -161,7 +160,7 @@ def start_tracks(
         _collect_by_model(params, name)[models] for name in ("position", "heading", "first_speed", "turning")
     )
     means = np.zeros((count, 6))
-    means[:, motion.MEASURED] = boxes[:, [0, 1, 6]]
+    means[:, motion.MEASURED_INDICES] = boxes[:, [0, 1, 6]]
     variances = np.column_stack([noise, noise, speed, speed, heading, np.where(turning > 0, 0.3, 0.0)]) ** 2
     covariances = np.einsum("ni,ij->nij", variances, np.eye(6))
     existence_params, zeros, ones = params.existence, np.zeros(count), np.ones(count)

@@ -57,10 +57,10 @@ class Tracker:
     def __call__(self, detections: Detections, stamp_ns: int = 0, pose: np.ndarray | None = None) -> Tracks:
         """Update the tracks with one frame and return them.
 
-        Boxes that are not finite or have no size are ignored. A frame with the same stamp as the
-        previous frame, or with a slightly older one, is ignored. If the frame after an older frame
-        continues from there, time is assumed to have restarted. A restart, or a jump of time or of
-        the sensor's pose, ends all tracks.
+        Boxes that are not finite or have no size are ignored. A frame is ignored if its stamp equals
+        that of the previous frame or is slightly older. If two such older frames follow each other
+        in order, time is assumed to have restarted. A restart, or a jump of time or of the sensor's
+        pose, ends all tracks.
 
         Args:
             detections: Boxes in the sensor's frame.
@@ -103,11 +103,11 @@ class Tracker:
         is_seen = np.zeros(len(states), bool)
         is_seen[i], is_seen[old_count:] = True, True
         seen_ids = set(states.ids[is_seen].tolist())
-        remaining = prune(states, self.params, self._ego.has_pose)
+        remaining_states = prune(states, self.params, self._ego.has_pose)
         self.started_count += len(new_detections)
-        self.ended_count += len(states) - len(remaining)
-        self._states = remaining
-        return self._make_tracks(np.array([i in seen_ids for i in remaining.ids.tolist()], bool))
+        self.ended_count += len(states) - len(remaining_states)
+        self._states = remaining_states
+        return self._make_tracks(np.array([i in seen_ids for i in remaining_states.ids.tolist()], bool))
 
     def predict(self, stamp_ns: int) -> Tracks:
         """Predict the tracks at stamp_ns, for a lost or late frame, without changing the tracker.

@@ -25,19 +25,18 @@ class Trails:
         trail starts from scratch.
 
         Args:
-            tracks: K tracks.
-            pose: (4, 4) pose of the sensor's frame, in which tracks and trails are given, in a
-                fixed frame.
+            pose: (4, 4) pose of the sensor, in whose frame tracks and trails are given, in a fixed
+                frame.
             stamp_ns: Time of the tracks.
             seconds: Duration of a trail.
         """
         length = int(seconds * 1e9)
-        oldest, min_gap = stamp_ns - length, length // (TRAIL_POINTS + 1)  # + 1 allows for uneven frame times
+        oldest_stamp, min_gap = stamp_ns - length, length // (TRAIL_POINTS + 1)  # + 1 allows for uneven frame times
         centres = tracks.detections.boxes[:, :3].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
-        previous, self._trails = self._trails, {}
+        previous_trails, self._trails = self._trails, {}
         for track_id, centre in zip(tracks.ids.tolist(), centres):
-            trail = previous.get(track_id) or deque(maxlen=TRAIL_POINTS)
-            while trail and trail[0][0] < oldest:
+            trail = previous_trails.get(track_id) or deque(maxlen=TRAIL_POINTS)
+            while trail and trail[0][0] < oldest_stamp:
                 trail.popleft()
             if len(trail) > 1 and trail[-1][0] - trail[-2][0] < min_gap:
                 trail.pop()  # drop the last position if it came too soon after the previous one

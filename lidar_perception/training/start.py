@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from lidar_perception.detectors.checkpoint import read_network_name
+from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.devices import find_device
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.files import make_folder
@@ -133,7 +133,7 @@ def _check_request(request: TrainingRequest, directory: RunDirectory, init: Path
     if request.budget is not None and not 0 < request.budget < math.inf:
         raise InputError(f"--budget {request.budget:g} must be a number of hours above 0")
     if init is not None:
-        read_network_name(init)
+        read_header(init)
     directory.require_no_run(request.resume)
 
 

@@ -18,14 +18,14 @@ from samples import object_folder
 
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors import weights_file
-from lidar_perception.detectors.checkpoint import Header, read_header, read_network_name, save_checkpoint
+from lidar_perception.detectors.checkpoint import Header, read_header, save_checkpoint
 from lidar_perception.detectors.checkpoint import Header as PointPillarsHeader
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.normalized_view import to_sensor_frame
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet.detector import PointNetDetector, load_pointnet_detector
 from lidar_perception.detectors.pointnet.network import load_pointnet
-from lidar_perception.detectors.pointnet.params import CLUSTERING, GROUND, STEPS
+from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorParams
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
 from lidar_perception.detectors.pointpillars.network import load_network
 from lidar_perception.ground.params import SensorPoseParams
@@ -34,6 +34,8 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, Detections, InputError, PointCloud
 
 pytestmark = pytest.mark.usefixtures("one_thread", "carrier_too")
+
+GROUND, CLUSTERING = PointNetDetectorParams().ground, PointNetDetectorParams().clustering
 
 
 @pytest.fixture(scope="module")
@@ -312,7 +314,7 @@ def copy_with_header(path, out, **changes):
 
 def test_checkpoint_survives_saving_and_loading(saved, tmp_path):
     path, pointpillars_path, header = saved
-    assert read_header(path) == header and read_network_name(path) == "pointnet"
+    assert read_header(path) == header and header.network == "pointnet"
     loaded_header, loaded = load_pointnet(path, header.config)
     assert loaded_header == header
     for name, value in lively(header.config).state_dict().items():
@@ -324,7 +326,7 @@ def test_checkpoint_survives_saving_and_loading(saved, tmp_path):
     old_file = copy_with_header(
         pointpillars_path, tmp_path / "first.safetensors", network=None
     )  # older checkpoints lack this key
-    assert read_network_name(pointpillars_path) == read_network_name(old_file) == "pointpillars"
+    assert read_header(pointpillars_path).network == read_header(old_file).network == "pointpillars"
     assert load_network(old_file)[0] == load_network(pointpillars_path)[0]
 
 
@@ -335,7 +337,7 @@ def test_weights_of_another_network_or_classes_are_rejected(saved, tmp_path):
     with pytest.raises(InputError, match=r"contains a PointPillars .*pointpillars_detector"):
         load_pointnet(pointpillars_path)
     unknown_network = copy_with_header(path, tmp_path / "u.safetensors", network="transformer")
-    for read in read_header, read_network_name, load_network:
+    for read in read_header, load_network:
         with pytest.raises(InputError, match="'transformer'; supported: "):
             read(unknown_network)
     two_classes = small(classes=("Car", "Pedestrian"), sizes=header.config.sizes[:2])

@@ -8,7 +8,7 @@ import pytest
 from lidar_perception.classes import CAR
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.boxes import MARGIN_M
-from lidar_perception.detectors.checkpoint import read_header, read_network_name
+from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.weights_file import POINTNET_WEIGHTS, POINTPILLARS_WEIGHTS, find_classifier_weights
 from lidar_perception.param_fields import with_values
@@ -26,7 +26,7 @@ MOST = {"pointpillars": 30e6, "pointnet": 6e6}  # bytes of all files
 def test_shipped_weights_exist_and_are_small():
     assert (POINTPILLARS_WEIGHTS / "pointpillars_v4_compact.safetensors") in FILES  # the default
     for network, max_size in MOST.items():
-        assert 0 < sum(f.stat().st_size for f in FILES if read_network_name(f) == network) < max_size
+        assert 0 < sum(f.stat().st_size for f in FILES if read_header(f).network == network) < max_size
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)

@@ -55,8 +55,8 @@ def test_recorded_poses_come_before_kiss_icp(monkeypatch, installed):
     for poses in True, False:
         recording = Recording(Path("drive"), "", frames, frozenset({POSES} if poses else ()))
         for wanted in RECORDED_EGO:
-            assert choose_ego_source(recording, wanted) == choose_recorded_source(poses, wanted)
-            assert wanted == "auto" or choose_recorded_source(poses, wanted) == wanted
+            expected = choose_recorded_source(poses) if wanted == "auto" else wanted
+            assert choose_ego_source(recording, wanted) == expected
 
 
 @pytest.mark.parametrize("installed", [True, False])

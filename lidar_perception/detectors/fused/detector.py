@@ -116,7 +116,7 @@ class FusedDetector(NetworkDetector):
         return other
 
     def with_raw_scores(self) -> FusedDetector:
-        """Return this detector, because its scores are not calibrated afterwards."""
+        """Return this detector unchanged: its curves already give calibrated probabilities."""
         return self
 
     def detect(self, frame: PointCloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None) -> DetectionResult:

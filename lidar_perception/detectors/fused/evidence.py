@@ -79,11 +79,11 @@ def compute_probabilities(models: Models, class_ids: np.ndarray, evidence: Evide
     """
     result = np.zeros(len(class_ids), np.float32)
     for class_id in np.unique(class_ids):
-        in_class = class_ids == class_id
+        is_in_class = class_ids == class_id
         if CLASSES[class_id] in models:
-            result[in_class] = expit(
+            result[is_in_class] = expit(
                 compute_log_odds(
-                    models[CLASSES[class_id]], {source: odds[in_class] for source, odds in evidence.items()}
+                    models[CLASSES[class_id]], {source: odds[is_in_class] for source, odds in evidence.items()}
                 )
             )
     return result
@@ -104,7 +104,7 @@ def compute_max_probabilities(models: Models, class_ids: np.ndarray, evidence: E
 
 
 def compute_source_probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence) -> dict[str, np.ndarray]:
-    """Return the probability (K,) float32 that each source alone gives the proposals, by source.
+    """Return, by source, the probability (K,) float32 of each proposal according to this source alone.
 
     It is NaN where the source provides no evidence or the model of the class does not use it.
     """

@@ -77,11 +77,7 @@ class Fusion:
         )
 
     def find_warnings(self, classes: Iterable[str]) -> list[str]:
-        """Return the curve_warning, if any, and a warning about classes without a curve.
-
-        Args:
-            classes: classes of the proposer.
-        """
+        """Return the curve_warning, if any, and a warning about classes of the proposer without a curve."""
         warnings = [self.curve_warning] if self.curve_warning else []
         if missing_classes := [name for name in classes if name not in self.models]:
             warnings.append(
@@ -111,11 +107,13 @@ def find_fusion(path: str | Path = "", params: FusedParams = FusedParams()) -> F
         if params.classifier:
             raise InputError(f"{name} already refers to PointNet weights; leave fused.classifier empty")
         return read_fusion(require_weights(name, "fused.weights"))
-    shipped = read_fusion(SHIPPED_FILE)
+    shipped_fusion = read_fusion(SHIPPED_FILE)
     return replace(
-        shipped,
-        proposer=require_weights(name, "fused.weights") if name else shipped.proposer,
-        classifier=require_weights(params.classifier, "fused.classifier") if params.classifier else shipped.classifier,
+        shipped_fusion,
+        proposer=require_weights(name, "fused.weights") if name else shipped_fusion.proposer,
+        classifier=require_weights(params.classifier, "fused.classifier")
+        if params.classifier
+        else shipped_fusion.classifier,
     )
 
 

@@ -29,8 +29,8 @@ class FusedParams(NetworkParams):
 
     weights: str = param(
         "",
-        "Output of `train fused`, which refers to both networks; a PointPillars "
-        "checkpoint; or your own class, module:Class. Empty: the shipped weights.",
+        "Output of `train fused`, which refers to both networks; a PointPillars checkpoint; or your own class, "
+        "module:Class. Empty: the shipped weights.",
         fixed=True,
     )
 

@@ -41,7 +41,7 @@ class Layer(NamedTuple):
 
 
 class CompiledPointNet:
-    """A network on the CPU that can be called from several threads; requires LANES > 0.
+    """PointNet with compiled kernels on a CPU with LANES > 0; it can be called from several threads.
 
     Args:
         tensors: state_dict of network.PointNet(config), by name.
@@ -107,21 +107,23 @@ class CompiledPointNet:
         rows[:, :POINT] = points[valid]
         density = (sizes / np.float32(self.config.points))[:, None].astype(np.float32)
         features = _apply_layers(self.points, rows)
-        parts, shallow = [], [kernels.compute_group_maxima(features, first, self.points[-1].channels)]
+        parts, shallow_features = [], [kernels.compute_group_maxima(features, first, self.points[-1].channels)]
         if self.local is not None:
             assert self.fine is not None
-            local, first_centre = self.local(rows, first, features, self.config.centroids)
-            fine = _apply_layers(self.fine, local)
-            parts.append(kernels.compute_group_maxima(fine, first_centre, self.fine[-1].channels))
-            shallow.append(kernels.compute_group_maxima(local, first_centre, self.local.join[-1].channels))
+            local_features, first_centre = self.local(rows, first, features, self.config.centroids)
+            fine_features = _apply_layers(self.fine, local_features)
+            parts.append(kernels.compute_group_maxima(fine_features, first_centre, self.fine[-1].channels))
+            shallow_features.append(
+                kernels.compute_group_maxima(local_features, first_centre, self.local.join[-1].channels)
+            )
             if self.coarse is not None:
-                coarse = self.coarse(rows, first, local, first_centre, self.config.coarse)
-                parts.append(coarse * (np.float32(0.5) + density))
+                coarse_features = self.coarse(rows, first, local_features, first_centre, self.config.coarse)
+                parts.append(coarse_features * (np.float32(0.5) + density))
         if self.raw is not None:
-            raw = kernels.compute_group_maxima(_apply_layers(self.raw, features), first, self.raw[-1].channels)
-            parts.append(raw * (np.float32(1.5) - density) if self.config.mrg else raw)
+            raw_features = kernels.compute_group_maxima(_apply_layers(self.raw, features), first, self.raw[-1].channels)
+            parts.append(raw_features * (np.float32(1.5) - density) if self.config.mrg else raw_features)
         if self.config.skip:
-            parts += shallow
+            parts += shallow_features
         head_input = _concatenate_padded([*parts, context])
         return self.outputs(_apply_layers(self.head, head_input))[:, : self.outputs.channels]
 
@@ -210,6 +212,6 @@ def _apply_layers(layers: Sequence[Layer], rows: np.ndarray) -> np.ndarray:
 def _concatenate_padded(parts: Sequence[np.ndarray]) -> np.ndarray:
     """Concatenate arrays (R, C_i) to (R, C) float32, padded with zeros for the next layer."""
     width = sum(part.shape[1] for part in parts)
-    padded = np.zeros((len(parts[0]), pad_channels(width)), np.float32)
-    np.concatenate(parts, axis=1, out=padded[:, :width])
-    return padded
+    padded_rows = np.zeros((len(parts[0]), pad_channels(width)), np.float32)
+    np.concatenate(parts, axis=1, out=padded_rows[:, :width])
+    return padded_rows

@@ -175,8 +175,8 @@ def _load_network(path: Path, device: str, engine: str) -> tuple[Header, Network
             raise InputError(
                 f"{path} runs in ONNX Runtime on the CPU, not on {device!r}; use the checkpoint it was exported from"
             )
-        exported = OnnxPointNet(path)
-        return exported.header, exported
+        exported_network = OnnxPointNet(path)
+        return exported_network.header, exported_network
     if device == CPU and engine == "auto" and LANES:
         with suppress(WeightsMismatch):  # load_pointnet() below reports the mismatch
             header, tensors = read_arrays(path, PointNetConfig)

@@ -111,12 +111,12 @@ class LocalNet(nn.Module):
         squared, indices = find_nearest(distances, max(k for _, k in self.groups))
         scales, density = [], []
         for (radius, k), net in zip(self.groups, self.nets):
-            in_radius = squared[..., :k] <= radius * radius  # (B, M, k)
-            neighbours = gather_rows(points, torch.where(in_radius, indices[..., :k], indices[..., :1]))
-            relative = (neighbours[..., :3] - centres[:, :, None]) / radius  # (B, M, k, 3)
-            scales.append(net(torch.cat([relative, neighbours[..., 3:]], dim=-1)).amax(dim=2))
+            is_in_radius = squared[..., :k] <= radius * radius  # (B, M, k)
+            neighbours = gather_rows(points, torch.where(is_in_radius, indices[..., :k], indices[..., :1]))
+            offsets = (neighbours[..., :3] - centres[:, :, None]) / radius  # (B, M, k, 3)
+            scales.append(net(torch.cat([offsets, neighbours[..., 3:]], dim=-1)).amax(dim=2))
             density.append(
-                in_radius.sum(dim=-1) / (k * radius)
+                is_in_radius.sum(dim=-1) / (k * radius)
                 if self.density == "neighbours"
                 else (distances <= radius * radius).sum(dim=-1) / radius**3
             )
@@ -138,14 +138,14 @@ class CoarseNet(nn.Module):
         centres = xyz[:, :count]
         squared, indices = find_nearest(compute_squared_distances(centres, xyz, valid), self.neighbours)
         indices = torch.where(squared <= self.radius**2, indices, indices[..., :1])
-        relative = (gather_rows(xyz, indices) - centres[:, :, None]) / self.radius
+        offsets = (gather_rows(xyz, indices) - centres[:, :, None]) / self.radius
         layer = self.net[0]
         assert isinstance(layer, LinearNormRelu)
-        return layer.apply_to_groups(relative, features, indices).amax(dim=2)
+        return layer.apply_to_groups(offsets, features, indices).amax(dim=2)
 
 
 class PointNet(nn.Module):
-    """Network for B clusters, with points (B, N, 5), valid (B, N) and context (B, 6) as in ClusterInput."""
+    """PointNet for B clusters, with points (B, N, 5), valid (B, N) and context (B, 6) as in ClusterInput."""
 
     temperature: Tensor
     offsets: Tensor
@@ -187,22 +187,22 @@ class PointNet(nn.Module):
     def forward(self, points: Tensor, valid: Tensor, context: Tensor) -> Outputs[Tensor]:
         config = self.config
         features = self.points(points)  # (B, N, C)
-        parts, shallow = [], [features.amax(dim=1)]
+        parts, shallow_features = [], [features.amax(dim=1)]
         # Grouped features have more weight in dense clusters, single points in sparse ones (Eq. 17).
         density = valid.sum(dim=1, keepdim=True) / config.points  # (B, 1)
         if self.local is not None and self.fine is not None:
-            local = self.local(points, features, valid, config.centroids)  # (B, M, C)
-            parts.append(self.fine(local).amax(dim=1))  # (B, C)
-            shallow.append(local.amax(dim=1))
+            local_features = self.local(points, features, valid, config.centroids)  # (B, M, C)
+            parts.append(self.fine(local_features).amax(dim=1))  # (B, C)
+            shallow_features.append(local_features.amax(dim=1))
         if self.coarse is not None:
             centroids, valid_centroids = points[:, : config.centroids, :3], valid[:, : config.centroids]
-            coarse = self.coarse(centroids, local, valid_centroids, config.coarse)  # (B, M', C)
-            parts.append(coarse.amax(dim=1) * (0.5 + density))
+            coarse_features = self.coarse(centroids, local_features, valid_centroids, config.coarse)  # (B, M', C)
+            parts.append(coarse_features.amax(dim=1) * (0.5 + density))
         if self.raw is not None:
-            raw = self.raw(features).amax(dim=1)
-            parts.append(raw * (1.5 - density) if config.mrg else raw)
+            raw_features = self.raw(features).amax(dim=1)
+            parts.append(raw_features * (1.5 - density) if config.mrg else raw_features)
         if config.skip:
-            parts += shallow
+            parts += shallow_features
         x = self.head(torch.cat([*parts, context], dim=1))
         box = self.box(x)
         bins = config.yaw_bins

@@ -64,7 +64,7 @@ def export_onnx(network: PointNet, header: Header, path: str | Path) -> None:
 
 
 class OnnxPointNet:
-    """An exported network in ONNX Runtime, on the CPU; a predict.Network."""
+    """Exported network in ONNX Runtime on the CPU, with the interface of predict.Network."""
 
     def __init__(self, path: str | Path):
         """Open an exported network; raise InputError if it cannot be used, see open_session."""

@@ -22,32 +22,27 @@ class PointNetParams(NetworkParams):
     min_points: int = param(3, "Ignore clusters with fewer points.", low=1, high=1_000_000)
     max_clusters: int = param(
         4000,
-        "Maximum number of clusters. The nearest ones are kept, and the "
-        "diagnostics report how many are ignored. A typical scan has a few hundred.",
+        "Maximum number of clusters. The nearest ones are kept, and the diagnostics report how many are ignored. A "
+        "typical scan has a few hundred.",
         low=1,
         high=1_000_000,
     )
     on_points: float = make_on_points_param()
     engine: str = param(
         "auto",
-        "Implementation of the network on the CPU. torch: torch. auto: "
-        "compiled kernels on x86-64 with AVX2, otherwise torch. Detections are the "
-        "same.",
+        "Implementation of the network on the CPU. auto: compiled kernels on x86-64 with AVX2, otherwise torch. torch: "
+        "always torch. Detections are the same.",
         choices=("auto", "torch"),
         fixed=True,
     )
-
-
-INPUT = InputParams()
-GROUND, CLUSTERING = PointNetConfig().ground, PointNetConfig().clustering
 
 
 @dataclass(frozen=True)
 class PointNetDetectorParams:
     """All parameter groups of PointNet."""
 
-    input: InputParams = INPUT
+    input: InputParams = InputParams()
     crop: CropParams = CropParams()
-    ground: GroundParams = GROUND
-    clustering: ClusteringParams = CLUSTERING
+    ground: GroundParams = PointNetConfig().ground
+    clustering: ClusteringParams = PointNetConfig().clustering
     pointnet: PointNetParams = PointNetParams()

@@ -105,9 +105,8 @@ class NetworkConfig:
         low, high: corners [x y z] of the range, metres.
         cell: side length of a pillar, metres.
         xy_scale: factor of x and y before the first layer. With 1, as in the papers and in imported
-            weights, x and y are 50 times larger than the other inputs. A compact network then
-            spends most of its few channels on the position of the pillar, which the grid encodes
-            anyway.
+            weights, x and y are 50 times larger than the other inputs, and a compact network spends
+            most of its few channels on the position of the pillar, which the grid encodes anyway.
         max_points: maximum number of points read per pillar, in the order of the cloud; 0: all.
             This field and the next two exist for imported weights.
         zero_row: pillars with fewer than max_points points also have a point with all inputs 0, as

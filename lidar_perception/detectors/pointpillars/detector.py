@@ -55,7 +55,7 @@ class PointPillarsDetector(NetworkDetector):
     def propose(
         self, frame: PointCloud, ground: np.ndarray | None = None, cluster_ids: np.ndarray | None = None
     ) -> DetectionResult:
-        """Detect objects as detect() does, but in NormalizedView coordinates and with the ego vehicle."""
+        """Detect objects in the coordinates of a NormalizedView, without dropping the ego vehicle."""
         t0 = perf_counter()
         config, settings = self.proposer.config, self.settings
         view = NormalizedView.of(frame, self.params.ground.sensor_pose, config.low, config.high, settings.use_intensity)

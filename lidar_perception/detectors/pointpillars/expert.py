@@ -52,8 +52,8 @@ def make_network_input(
 
     Args:
         ground: (N,) bool; None: computed if the version needs it.
-        cluster_ids: (N,) int, 0 for no cluster; None: computed if the version needs it. For the
-            network, the ids are renumbered from 1 in the same order.
+        cluster_ids: (N,) int, 0 for no cluster; None: computed if the version needs it. They are
+            renumbered from 1 in the same order.
     """
     ground, cluster_ids = run_experts(view, config, ground, cluster_ids, ground_params, clustering)
     if config.remove_ground:

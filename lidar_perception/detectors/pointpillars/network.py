@@ -92,15 +92,14 @@ class PillarNet(nn.Module):
     def _add_zero_rows(self, image: Tensor, cells: Tensor, inputs: Tensor) -> Tensor:
         """Add the output for an all-zero point to pillars with fewer than max_points points.
 
-        Args:
-            image: (B * H * W, C) zeros.
-            inputs: (1, inputs of the layer), which gives the shape and dtype of the zero point.
+        The image (B * H * W, C) is all zeros. `inputs` (1, I) only gives the shape and dtype of the
+        all-zero point.
         """
         ones = torch.ones_like(cells, dtype=image.dtype)
         sizes = image.new_zeros(len(image)).scatter_add(0, cells, ones)
         is_padded = ((sizes > 0) & (sizes < self.config.max_points))[:, None]
-        zero = functional.relu(self.norm(self.linear(torch.zeros_like(inputs))))
-        return image + is_padded * zero
+        zero_output = functional.relu(self.norm(self.linear(torch.zeros_like(inputs))))
+        return image + is_padded * zero_output
 
 
 class MapNet(nn.Sequential):
@@ -145,11 +144,11 @@ class FpnNeck(nn.Module):
 
     def forward(self, maps: list[Tensor]) -> Tensor:  # finest first: H/2, H/4, H/8
         levels = [lateral(x) for lateral, x in zip(self.laterals, maps)]  # (B, 2C, ...) each
-        fused = levels.pop()
+        fused_map = levels.pop()
         for scale, level in zip(reversed(self.scales), reversed(levels)):
-            fused = functional.interpolate(fused, scale_factor=float(scale), mode="bilinear")
-            fused = fused + level if self.fusion == "add" else torch.cat([fused, level], dim=1)
-        return self.out(fused)  # (B, 2C, H/2, W/2)
+            fused_map = functional.interpolate(fused_map, scale_factor=float(scale), mode="bilinear")
+            fused_map = fused_map + level if self.fusion == "add" else torch.cat([fused_map, level], dim=1)
+        return self.out(fused_map)  # (B, 2C, H/2, W/2)
 
 
 class Head(nn.Module):
@@ -185,7 +184,7 @@ class Head(nn.Module):
         return _reshape_by_anchor(self.scores(features), self.classes)
 
     def compute_boxes(self, features: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute codes (M, 7) and directions (M, 2) of the anchors with indices (M,) of a single cloud."""
+        """Compute codes (M, 7) and directions (M, 2) of some anchors, given as indices (M,), of a single cloud."""
         rows = features[0].flatten(1)[:, anchors // self.per_cell].T  # (M, C)
         slots = anchors % self.per_cell  # index of each anchor within its cell
 
@@ -269,9 +268,9 @@ def fuse_norms(network: PointPillars) -> PointPillars:
     for module in network.modules():
         if isinstance(module, ConvNormRelu):
             conv, norm, _ = module
-            transposed = isinstance(conv, nn.ConvTranspose2d)
+            is_transposed = isinstance(conv, nn.ConvTranspose2d)
             if isinstance(conv, Conv) and isinstance(norm, nn.BatchNorm2d):
-                module[0], module[1] = fuse_conv_bn_eval(conv, norm, transposed), nn.Identity()
+                module[0], module[1] = fuse_conv_bn_eval(conv, norm, is_transposed), nn.Identity()
     net = network.pillar_net
     if isinstance(net.norm, nn.BatchNorm1d):
         net.linear, net.norm = fuse_linear_bn_eval(net.linear, net.norm), nn.Identity()

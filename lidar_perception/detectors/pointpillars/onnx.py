@@ -53,7 +53,7 @@ def _describe_inputs(config: NetworkConfig) -> dict[str, tuple[str, tuple[int, .
 
 
 def export_onnx(network: PointPillars, header: Header, path: str | Path) -> None:
-    """Export a network for single clouds to ONNX, with its header as metadata.
+    """Export a network to ONNX, for one cloud per call, with its header as metadata.
 
     Inputs are points (N, 4 or 5), offsets (N, 5 or 6) float32 and cells (N,) int64 as in
     pillars.Pillars, and for V4 cluster_map (1, 3, H, W) uint8. Outputs are logits (1, A, K), codes

@@ -29,8 +29,8 @@ class PointPillarsParams(NetworkParams):
     )
     size: str = param(
         "auto",
-        "full: the paper's network, for a GPU. compact: for two CPU cores. "
-        "auto: the size of the weights, by default compact.",
+        "full: the paper's network, for a GPU. compact: for two CPU cores. auto: the size of the weights, by default "
+        "compact.",
         choices=("auto", "full", "compact"),
         fixed=True,
     )
@@ -44,14 +44,13 @@ class PointPillarsParams(NetworkParams):
 # pedestrians, split cars.
 EXPERT_GROUND = GroundParams(method="patchwork")
 EXPERT_CLUSTERING = ClusteringParams(density=FULL_DENSITY, dbscan=DbscanParams(eps=(0.5, 0.7, 1.0), min_samples=5))
-INPUT = InputParams()
 
 
 @dataclass(frozen=True)
 class DetectorParams:
     """All parameter groups of PointPillars. `ground` and `clustering` configure its experts."""
 
-    input: InputParams = INPUT
+    input: InputParams = InputParams()
     crop: CropParams = CropParams()
     ground: GroundParams = EXPERT_GROUND
     clustering: ClusteringParams = EXPERT_CLUSTERING

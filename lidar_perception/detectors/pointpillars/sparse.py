@@ -60,7 +60,7 @@ def find_unsupported_feature(config: NetworkConfig) -> str | None:
 
 
 class SparseNetwork:
-    """A network on the CPU that can be called from several threads.
+    """PointPillars network with sparse inference on the CPU; it can be called from several threads.
 
     Args:
         config: config for which find_unsupported_feature returns None.
@@ -142,32 +142,35 @@ class SparseNetwork:
 
     def _make_pillar_map(self, pillars: Pillars[np.ndarray]) -> Map:
         points, offsets, cells = pillars[:3]
-        occupied = np.zeros(pillars.grid, bool)
-        occupied.ravel()[cells] = True
-        occupied_cells, index = kernels.number_cells(occupied, _make_blank_index(pillars.grid), 1)
+        has_points = np.zeros(pillars.grid, bool)
+        has_points.ravel()[cells] = True
+        occupied_cells, index = kernels.number_cells(has_points, _make_blank_index(pillars.grid), 1)
         rows = np.zeros((1 + len(occupied_cells), self.pillar_columns), np.float32)
         kernels.write_pillar_maxima(points, offsets, cells, index, self.pillar_weights, self.pillar_bias, rows)
         return Map(index, rows)
 
-    def _choose_cells(self, occupied: list[np.ndarray], reach: int | None) -> list[np.ndarray]:
-        """Return a mask (H, W) bool of the cells to compute for each layer."""
-        masks = list(occupied)
+    def _choose_cells(self, input_masks: list[np.ndarray], reach: int | None) -> list[np.ndarray]:
+        """Return a mask (H, W) bool of the cells to compute for each layer.
+
+        The input masks (H, W) bool are True for the occupied cells of the input maps.
+        """
+        masks = list(input_masks)
         for layer in self.layers:
             masks.append(layer.find_affected_cells(masks))
         if reach is None:
             masks[-1] = np.ones_like(masks[-1])
         else:
-            scale = len(occupied[0]) // len(masks[-1])
-            masks[-1] = dilate(shrink(occupied[0], scale), reach)
+            scale = len(input_masks[0]) // len(masks[-1])
+            masks[-1] = dilate(shrink(input_masks[0], scale), reach)
         # The layers before the blocks have so few cells that selecting some of them would take longer
         # than computing all.
-        required = [None if i < self.first_block else np.zeros_like(mask) for i, mask in enumerate(masks)]
-        required[-1] = masks[-1]
-        for i, mask in reversed([*enumerate(required)]):
+        required_masks = [None if i < self.first_block else np.zeros_like(mask) for i, mask in enumerate(masks)]
+        required_masks[-1] = masks[-1]
+        for i, mask in reversed([*enumerate(required_masks)]):
             if mask is not None:
-                self.layers[i - len(occupied)].mark_required_cells(mask, required)
+                self.layers[i - len(input_masks)].mark_required_cells(mask, required_masks)
                 masks[i] &= mask
-        return masks[len(occupied) :]
+        return masks[len(input_masks) :]
 
     def _run(self, inputs: list[Map], cell_masks: Sequence[np.ndarray], empty_maps: Sequence[Map]) -> list[Map]:
         """Return the maps of all layers; cells outside the masks have the values of an empty cloud."""
@@ -216,9 +219,7 @@ class SparseNetwork:
 def _evaluate_at(layer: Weights, per_cell: int, slots: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Evaluate a layer of the head at N anchors; return (N, C / per_cell).
 
-    Args:
-        slots: (N,) index of each anchor within its cell.
-        rows: (N, B) features of the cells.
+    `slots` (N,) is the index of each anchor within its cell, `rows` (N, B) are the cells' features.
     """
     weight = layer.weight.reshape(per_cell, -1, rows.shape[1])[slots]
     assert layer.bias is not None
@@ -232,8 +233,8 @@ def _make_blank_index(grid: Grid) -> np.ndarray:
 
 def _make_cluster_map(maps: np.ndarray) -> Map:
     """Convert cluster maps (3, H, W) uint8 to a Map."""
-    occupied = (maps[0] | maps[1] | maps[2]) > 0
-    cells, index = kernels.number_cells(occupied, _make_blank_index(occupied.shape), 1)
+    is_occupied = (maps[0] | maps[1] | maps[2]) > 0
+    cells, index = kernels.number_cells(is_occupied, _make_blank_index(is_occupied.shape), 1)
     rows = np.zeros((1 + len(cells), pad_channels(3)), np.float32)
     rows[1:, :3] = maps.reshape(3, -1)[:, cells].T
     return Map(index, rows)

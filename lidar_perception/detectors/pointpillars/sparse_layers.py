@@ -50,13 +50,16 @@ class Layer:
         height, width = grids[self.sources[0]]
         return height // self.stride, width // self.stride
 
-    def find_affected_cells(self, occupied: Sequence[np.ndarray]) -> np.ndarray:
-        """Return a mask (H, W) bool of the output cells that depend on an occupied cell of earlier maps."""
-        occupied_inputs = np.logical_or.reduce([occupied[source] for source in self.sources])
+    def find_affected_cells(self, masks: Sequence[np.ndarray]) -> np.ndarray:
+        """Return a mask (H, W) bool of the output cells that depend on an occupied cell of an earlier map.
+
+        `masks` are the masks (H, W) bool of the occupied cells of the earlier maps.
+        """
+        occupied_inputs = np.logical_or.reduce([masks[source] for source in self.sources])
         mask = dilate(occupied_inputs, self.window)[:: self.stride, :: self.stride]
         if self.coarse is None:
             return mask
-        return mask | dilate(enlarge(occupied[self.coarse], self.scale), (self.scale + 1) // 2)
+        return mask | dilate(enlarge(masks[self.coarse], self.scale), (self.scale + 1) // 2)
 
     def mark_required_cells(self, output_cells: np.ndarray, masks: Sequence[np.ndarray | None]) -> None:
         """Mark the cells of earlier maps that are required to compute `output_cells`.
@@ -76,8 +79,7 @@ class Layer:
     def compute_margin(self, margins: Sequence[int]) -> int:
         """Return the width in cells of the border where an empty cloud's output may differ from the interior.
 
-        Args:
-            margins: this width for each earlier map.
+        `margins` are the widths for the earlier maps.
         """
         width = max(-(-margins[source] // self.stride) for source in self.sources) + self.window
         if self.coarse is None:
@@ -160,13 +162,13 @@ def make_layers(config: NetworkConfig, tensors: LayerWeights) -> list[Layer]:
         for k in range(1 + extra_layers):
             sources = [add_layer(f"blocks.{i}.{k}", sources, out, stride=1 if k else stride)]
         levels += sources
-    fused: int | None = None
+    fused_map: int | None = None
     scales = [*config.block_strides[1:], 1]
     for i in reversed(range(len(levels))):
-        fused = add_layer(
-            f"neck.laterals.{i}", [levels[i]], config.fpn_channels, 1, has_norm=False, coarse=fused, scale=scales[i]
+        fused_map = add_layer(
+            f"neck.laterals.{i}", [levels[i]], config.fpn_channels, 1, has_norm=False, coarse=fused_map, scale=scales[i]
         )
-    assert fused is not None
-    features = add_layer("neck.out", [fused], config.fpn_channels)
+    assert fused_map is not None
+    features = add_layer("neck.out", [fused_map], config.fpn_channels)
     add_layer("head.scores", [features], config.anchors_per_cell * len(config.classes), 1, has_norm=False)
     return layers

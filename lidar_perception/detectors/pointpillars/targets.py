@@ -70,8 +70,8 @@ def encode(boxes: Tensor, anchors: Tensor, offset: float) -> tuple[Tensor, Tenso
 
 def find_heading_bin(yaw: Tensor, offset: float) -> Tensor:
     """Return bins (N,) int64: 0 for yaw in [offset, offset + pi), otherwise 1."""
-    relative = torch.remainder(yaw - offset, 2 * math.pi)
-    return (relative >= math.pi).long()
+    relative_yaw = torch.remainder(yaw - offset, 2 * math.pi)
+    return (relative_yaw >= math.pi).long()
 
 
 def assign_targets(anchors: Tensor, config: NetworkConfig, boxes: Tensor, labels: Tensor) -> Targets:

@@ -13,7 +13,7 @@ from lidar_perception.runs.threads import set_torch_threads
 
 
 class TorchNetwork:
-    """A PointPillars network with batch norms folded into its layers.
+    """PointPillars network in torch, with batch norms folded into its layers.
 
     Args:
         amp: number format of the layers, see devices.choose_dtype.

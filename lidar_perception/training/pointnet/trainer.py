@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidar_perception.detectors.checkpoint import POINTPILLARS, read_network_name
+from lidar_perception.detectors.checkpoint import POINTPILLARS, read_header
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.network import PointNet
 from lidar_perception.detectors.pointnet.params import PointNetParams
@@ -46,7 +46,7 @@ def find_proposer(params: PointNetTraining) -> Path | None:
     if params.proposer in ("", str(PACKAGE)):
         return find_proposer_weights() if params.proposer else None
     path = require_weights(params.proposer, "proposer")
-    if read_network_name(path) != POINTPILLARS:
+    if read_header(path).network != POINTPILLARS:
         raise InputError(f"{path} is not a PointPillars checkpoint; give one with --proposer")
     return path
 
