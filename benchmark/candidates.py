@@ -37,7 +37,7 @@ def compare_candidates(frames: list[Frame], repeat: int) -> dict:
         plain_results = [plain_stm_cpa.find_candidates(*arguments) for _ in range(min(repeat, 3))]
         our_results = [find_candidates(scan, make_truth_source(truth), camera, PAPER) for _ in range(repeat)]
         _append_medians(plain_ms, [r["ms"] for r in plain_results])
-        _append_medians(our_ms, [refined.ms for _, refined in our_results])
+        _append_medians(our_ms, [refined_candidates.ms for _, refined_candidates in our_results])
         _append_medians(
             best_ms, [find_candidates(scan, make_truth_source(truth), camera, BEST)[1].ms for _ in range(repeat)]
         )
@@ -47,9 +47,11 @@ def compare_candidates(frames: list[Frame], repeat: int) -> dict:
         agreement["labels_identical"] += np.array_equal(ids, result["labels"])
         boxes = fit_grounded_boxes(result["points"], result["ground"], ids)
         segmented = SegmentedCloud(np.arange(len(ids)), result["points"], result["ground"], ids, boxes)
-        refined = refine_segmented(segmented, make_truth_source(truth), PAPER)
+        refined_candidates = refine_segmented(segmented, make_truth_source(truth), PAPER)
         agreement["candidates_same_given_ground"] += all(
-            len(getattr(refined, s)) == len(result[s]) == _count_equal_boxes(getattr(refined, s).boxes, result[s])
+            len(getattr(refined_candidates, s))
+            == len(result[s])
+            == _count_equal_boxes(getattr(refined_candidates, s).boxes, result[s])
             for s in STAGES
         )
         # Here each implementation uses its own RANSAC.

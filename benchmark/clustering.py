@@ -30,12 +30,12 @@ def measure_dbscan(title: str, clouds: list[np.ndarray], repeat: int, target: fl
     points, must be equal to scikit-learn's. For other peers, the noise and the partition of the core
     points must be equal.
     """
-    installed = [p for p in peers.DBSCANS if not p.find_problem()]
+    installed_peers = [p for p in peers.DBSCANS if not p.find_problem()]
     rows = {p.name: make_row(p.name, note=p.find_problem()) for p in peers.DBSCANS}
     ms: dict[str, float] = {}
     for group, run in (
-        ([p for p in installed if p != peers.WHEEL], measure_dbscans),
-        ([p for p in installed if p == peers.WHEEL], partial(run_in_child, measure_dbscans)),
+        ([p for p in installed_peers if p != peers.WHEEL], measure_dbscans),
+        ([p for p in installed_peers if p == peers.WHEEL], partial(run_in_child, measure_dbscans)),
     ):
         if group:
             times, same_counts, differ_counts = run([peers.DBSCANS.index(p) for p in group], clouds, repeat, title)

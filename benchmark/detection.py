@@ -46,12 +46,12 @@ def measure_detection(scans: list[PointCloud], repeat: int, sizes: Sequence[str]
     device_name = torch.cuda.get_device_name(device) if device != CPU else read_cpu_name()
     content: dict[str, Any] = {"device": device_name, "threads": get_thread_count(), "sizes": {}}
     for size in sizes:
-        selected = choose_evenly(scans, MAX_SLOW_SCANS) if (size, device) == ("full", CPU) else scans
-        detectors = {version: _make_detector(version, size, device, selected[0]) for version in VERSIONS}
+        selected_scans = choose_evenly(scans, MAX_SLOW_SCANS) if (size, device) == ("full", CPU) else scans
+        detectors = {version: _make_detector(version, size, device, selected_scans[0]) for version in VERSIONS}
         content["sizes"][size] = {
-            "frames": len(selected),
-            "points": float(np.median([len(s) for s in selected])),
-            "versions": _compute_medians(detectors, selected, repeat, f"PointPillars {size}"),
+            "frames": len(selected_scans),
+            "points": float(np.median([len(s) for s in selected_scans])),
+            "versions": _compute_medians(detectors, selected_scans, repeat, f"PointPillars {size}"),
         }
     return content
 

@@ -50,9 +50,9 @@ def measure_graph(recording: Recording) -> dict[str, dict]:
         write_bag(drive, show_progress(recording, "writing a bag", len(recording)))
         with Bag(drive) as bag:
             clouds = bag.counts[POINTS]
-        for i, (name, (arguments, busy)) in enumerate(RUNS.items()):
+        for i, (name, (arguments, busy_count)) in enumerate(RUNS.items()):
             load = os.getloadavg()[0]
-            with run_busy_processes(busy):
+            with run_busy_processes(busy_count):
                 content = replay(drive, clouds, Path(folder) / str(i), **arguments)
             runs[name] = {key: content[key] for key in ("clouds", "results", "latency_ms", "memory_mb", "stage_ms")} | {
                 "speed": 1 / content["slower"],

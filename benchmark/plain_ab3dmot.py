@@ -81,14 +81,14 @@ class PlainAb3dmot:
         measurements = [box[[0, 1, 2, 6, 3, 4, 5]] for box in boxes]
         for track in tracks:
             track.predict()
-        gate, unassigned = GATES.get(CLASSES[class_id], OTHER_GATE), set(range(len(measurements)))
+        gate, unassigned_indices = GATES.get(CLASSES[class_id], OTHER_GATE), set(range(len(measurements)))
         if tracks and measurements:
             distance = np.array([[np.linalg.norm(m[:3] - t.state[:3]) for t in tracks] for m in measurements])
             for i, j in zip(*linear_sum_assignment(distance)):
                 if distance[i, j] <= gate:
                     tracks[j].update(measurements[i], float(detections.scores[i]))
-                    unassigned.discard(int(i))
-        for i in sorted(unassigned):
+                    unassigned_indices.discard(int(i))
+        for i in sorted(unassigned_indices):
             tracks.append(_Track(self.next, np.append(measurements[i], np.zeros(3)), float(detections.scores[i])))
             self.next += 1
         self.tracks[class_id] = [t for t in tracks if t.age < MAX_AGE]

@@ -46,12 +46,12 @@ def _compute_thresholds(tree: cKDTree, params: EuclideanParams) -> np.ndarray:
     return (params.alpha * mean).astype(np.float32).astype(np.float64)
 
 
-def _find_neighbours(tree: cKDTree, selected: np.ndarray, radius: float) -> Iterator[tuple]:
+def _find_neighbours(tree: cKDTree, is_selected: np.ndarray, radius: float) -> Iterator[tuple]:
     """Yield pairs of neighbours: indices of selected points, indices of points near them, squared distances.
 
     Some pairs are slightly farther apart than the radius. The search runs in parts to limit memory.
     """
-    rows = tree.indices[selected[tree.indices]]  # in tree order, so that each part is spatially compact
+    rows = tree.indices[is_selected[tree.indices]]  # in tree order, so that each part is spatially compact
     if len(rows) == 0:
         return
     count = tree.query_ball_point(tree.data[rows], radius, return_length=True)

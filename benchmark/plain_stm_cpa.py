@@ -125,8 +125,8 @@ def _draw_silhouette(cluster: np.ndarray, steps: int) -> np.ndarray:
     rows = (z.max() - all_z) / max(np.ptp(z), 1e-6) * ROWS
     image = np.zeros((ROWS, COLUMNS), np.uint8)
     image[np.minimum(rows.astype(int), ROWS - 1), np.minimum(columns.astype(int), COLUMNS - 1)] = 1
-    closed = cv2.morphologyEx(image, cv2.MORPH_CLOSE, KERNEL)
-    return cv2.dilate(closed, KERNEL).ravel().astype(float)
+    closed_image = cv2.morphologyEx(image, cv2.MORPH_CLOSE, KERNEL)
+    return cv2.dilate(closed_image, KERNEL).ravel().astype(float)
 
 
 def _compute_cosine(a: np.ndarray, b: np.ndarray) -> float:

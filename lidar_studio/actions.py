@@ -247,10 +247,10 @@ def _set_class(state: State, action: Action, motion: Motion) -> Outcome:
 
 def _reject_rest(state: State, action: Action, motion: Motion) -> Outcome:
     class_name = require_class_name(action) if "class" in action else None
-    undecided = [t for t in state.tracks.values() if t.state == PROPOSED and class_name in (None, t.class_name)]
-    if not undecided:
+    undecided_tracks = [t for t in state.tracks.values() if t.state == PROPOSED and class_name in (None, t.class_name)]
+    if not undecided_tracks:
         raise InputError(f"no undecided tracks{f' of class {class_name}' if class_name else ''} to reject")
-    return _replace_tracks(state, *(replace(t, state=REJECTED) for t in undecided))
+    return _replace_tracks(state, *(replace(t, state=REJECTED) for t in undecided_tracks))
 
 
 def _accept_track(state: State, action: Action, motion: Motion, new_state: str = ACCEPTED) -> Outcome:
@@ -278,7 +278,7 @@ def _merge_tracks(state: State, action: Action, motion: Motion) -> Outcome:
     boxes = {**second.boxes, **first.boxes}
     boxes |= {f: b for f, b in second.boxes.items() if b.kind == KEY and boxes[f].kind != KEY}
     removed_frames = (first.removed_frames | second.removed_frames) - boxes.keys()
-    merged = replace(
+    merged_track = replace(
         first,
         boxes=boxes,
         removed_frames=removed_frames,
@@ -287,13 +287,13 @@ def _merge_tracks(state: State, action: Action, motion: Motion) -> Outcome:
         is_partly_tracked=False,
     )
     seeds = tuple(dict.fromkeys((f, first.id if t == second.id else t) for f, t in state.seeds))
-    return {first.id: merged, second.id: None}, seeds, state.checked_frames
+    return {first.id: merged_track, second.id: None}, seeds, state.checked_frames
 
 
 def _split_track(state: State, action: Action, motion: Motion) -> Outcome:
     track, frame = require_track(state, action.get("track")), require_frame(action, motion)
-    earlier, later = ({f for f in track.boxes if (f >= frame) == is_after} for is_after in (False, True))
-    if not earlier or not later:
+    earlier_frames, later_frames = ({f for f in track.boxes if (f >= frame) == is_after} for is_after in (False, True))
+    if not earlier_frames or not later_frames:
         raise InputError(
             f"track {track.id} cannot be split at frame {frame}: it needs boxes both before and from this frame on"
         )
@@ -312,7 +312,7 @@ def _split_track(state: State, action: Action, motion: Motion) -> Outcome:
     new_id = state.next_id
     seeds = tuple((f, new_id if t == track.id and f >= frame else t) for f, t in state.seeds)
     return (
-        {track.id: make_part(earlier, track.id, False), new_id: make_part(later, new_id, True)},
+        {track.id: make_part(earlier_frames, track.id, False), new_id: make_part(later_frames, new_id, True)},
         seeds,
         state.checked_frames,
     )

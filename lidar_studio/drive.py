@@ -121,9 +121,9 @@ class ScanCache:
                 self._scans[i] = scan
                 self._size += scan.nbytes
                 while self._size > self._max_bytes and len(self._scans) > 1:
-                    index, oldest = self._scans.popitem(last=False)
+                    index, oldest_scan = self._scans.popitem(last=False)
                     self._locks.pop(index, None)
-                    self._size -= oldest.nbytes
+                    self._size -= oldest_scan.nbytes
             return scan
 
 
@@ -202,10 +202,10 @@ def select_drive(recording: Recording, sequence: str | None = None) -> Drive:
         raise InputError(
             f"{recording.path} has no drive {sequence}; available drives: {names_text}" + suggest_name(sequence, names)
         )
-    selected = names[0] if sequence is None else sequence
-    frames = [frame for frame in all_frames if frame.sequence == selected]
+    selected_name = names[0] if sequence is None else sequence
+    frames = [frame for frame in all_frames if frame.sequence == selected_name]
     path = Path(recording.path).absolute()
-    return Drive("_".join(filter(None, (path.name, selected))), replace(recording, frames=frames))
+    return Drive("_".join(filter(None, (path.name, selected_name))), replace(recording, frames=frames))
 
 
 def require_clouds(drive: Drive) -> None:

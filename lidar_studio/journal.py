@@ -21,14 +21,14 @@ JOURNAL_NAME, VERSION = "journal.jsonl", 1
 
 
 def make_journal_header(
-    drive: str, names: Sequence[str], stamps_ns: Sequence[int], clouds: str = "", posed: bool | None = None
+    drive: str, names: Sequence[str], stamps_ns: Sequence[int], cloud_digest: str = "", has_poses: bool | None = None
 ) -> dict[str, Any]:
     """Make the first line of a journal, which identifies the drive by its frames.
 
     Args:
-        drive: Name of the drive. It is not compared if `clouds` matches.
-        clouds: Digest of some of the clouds, or "" if unknown.
-        posed: True if the drive has sensor poses.
+        drive: Name of the drive. It is not compared if `cloud_digest` matches.
+        cloud_digest: Digest of some of the clouds, or "" if unknown.
+        has_poses: True if the drive has sensor poses.
     """
     stamps = hashlib.sha256(" ".join(map(str, stamps_ns)).encode()).hexdigest()[:16]
     return {
@@ -38,8 +38,8 @@ def make_journal_header(
         "first": names[0] if names else "",
         "last": names[-1] if names else "",
         "stamps_sha": stamps,
-        "clouds": clouds,
-        "posed": posed,
+        "clouds": cloud_digest,
+        "posed": has_poses,
     }
 
 
@@ -146,12 +146,12 @@ class Journal:
             expected.pop("clouds")
         elif header["clouds"] == expected["clouds"]:
             expected.pop("drive")
-        posed = expected.pop("posed", None), header.get("posed")
-        if set(posed) == {True, False}:
-            current, recorded = ("with" if value else "without" for value in posed)
+        pose_flags = expected.pop("posed", None), header.get("posed")
+        if set(pose_flags) == {True, False}:
+            current_text, recorded_text = ("with" if has_poses else "without" for has_poses in pose_flags)
             raise InputError(
-                f"{self.path} was recorded {recorded} sensor poses, but the drive is now opened {current} poses, "
-                "which would change all interpolated boxes; open the drive as before, or choose another --out"
+                f"{self.path} was recorded {recorded_text} sensor poses, but the drive is now opened {current_text} "
+                "poses, which would change all interpolated boxes; open the drive as before, or choose another --out"
             )
         if differences := find_differences({k: header.get(k) for k in expected}, expected):
             raise InputError(

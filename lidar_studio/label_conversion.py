@@ -93,17 +93,17 @@ def to_labels(state: State, frames: Sequence[Frame]) -> DriveLabels:
 
 def _choose_ids(state: State) -> dict[int, int]:
     """Choose unique ids for the export of the accepted tracks. Imported ids are kept where possible."""
-    accepted = [t for t in state.tracks.values() if t.state == ACCEPTED]
+    accepted_tracks = [t for t in state.tracks.values() if t.state == ACCEPTED]
     ids: dict[int, int] = {}
     used_ids = set[int]()
-    for t in accepted:
+    for t in accepted_tracks:
         imported_ids = {extra[ID] for extra in t.extra.values() if ID in extra}
         if len(t.boxes) > 1:  # a person may have merged boxes without an id
             imported_ids.discard(NO_TRACK)
         if len(imported_ids) == 1 and (imported_id := imported_ids.pop()) not in used_ids:
             ids[t.id] = imported_id
             used_ids |= {imported_id} - {NO_TRACK}
-    for t in accepted:
+    for t in accepted_tracks:
         if t.id not in ids:
             ids[t.id] = t.id if t.id not in used_ids else max(used_ids | set(state.tracks)) + 1
             used_ids.add(ids[t.id])

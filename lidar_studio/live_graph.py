@@ -122,10 +122,10 @@ class LiveGraph:
         """One past the number of the newest frame."""
         return self._next
 
-    def set_paused(self, page: int, paused: bool) -> None:
+    def set_paused(self, page: int, is_paused: bool) -> None:
         """Pause or resume a page. New clouds are skipped while any page is paused."""
         with self._lock:
-            (self._paused_pages.add if paused else self._paused_pages.discard)(page)
+            (self._paused_pages.add if is_paused else self._paused_pages.discard)(page)
 
     def expect_topic(self, topic: str, kind: str) -> None:
         """Add a topic with boxes of a kind. Clouds wait for its arrays."""
@@ -151,10 +151,10 @@ class LiveGraph:
             self._next += 1
             self._bytes += len(message.data)
             while len(self._frames) > 1 and (self._bytes > self.max_bytes or len(self._frames) > self.max_frames):
-                oldest = self._frames.pop(self.first)
-                if self._by_stamp.get(oldest.stamp_ns) is oldest:
-                    del self._by_stamp[oldest.stamp_ns]
-                self._bytes -= len(oldest.cloud.data)
+                oldest_frame = self._frames.pop(self.first)
+                if self._by_stamp.get(oldest_frame.stamp_ns) is oldest_frame:
+                    del self._by_stamp[oldest_frame.stamp_ns]
+                self._bytes -= len(oldest_frame.cloud.data)
             for topic, box_topic in self.topics.items():
                 if stamp in box_topic.early_arrays:
                     self._add_objects(frame, topic, *box_topic.early_arrays.pop(stamp))
@@ -226,10 +226,10 @@ class LiveGraph:
                 if frame.is_shown:
                     break
                 if expected_topics <= frame.objects.keys() or now - frame.received_s > MAX_WAIT_S:
-                    for older in self._frames.values():
-                        if not older.is_shown and older.number <= frame.number:
-                            older.is_shown = True
-                            self._notify(self._make_event(older))
+                    for older_frame in self._frames.values():
+                        if not older_frame.is_shown and older_frame.number <= frame.number:
+                            older_frame.is_shown = True
+                            self._notify(self._make_event(older_frame))
                     break
             if (status := self.get_status()) != self._last_status:
                 self._last_status = status

@@ -47,7 +47,7 @@ def resolve_topic(topic: str, namespace: str) -> str:
     return "/" + "/".join(filter(None, (*parts, topic.strip("/"))))
 
 
-def select_cloud_topic(types: Mapping[str, str], namespace: str = "", requested: str = "") -> str:
+def select_cloud_topic(types: Mapping[str, str], namespace: str = "", requested_topic: str = "") -> str:
     """Select the requested cloud topic, otherwise the one with the most columns or the only one.
 
     Args:
@@ -58,8 +58,8 @@ def select_cloud_topic(types: Mapping[str, str], namespace: str = "", requested:
     """
     cloud_topics = sorted(t for t, kind in types.items() if kind == POINT_CLOUD)
     in_namespace = f" in namespace {namespace}" if namespace else ""
-    if requested:
-        full_name = resolve_topic(requested, namespace)
+    if requested_topic:
+        full_name = resolve_topic(requested_topic, namespace)
         if full_name not in cloud_topics:
             raise InputError(
                 f"no point clouds are published on {full_name}; cloud topics: {', '.join(cloud_topics) or 'none'}"
@@ -84,7 +84,7 @@ def select_cloud_topic(types: Mapping[str, str], namespace: str = "", requested:
 
 
 def select_box_topics(
-    types: Mapping[str, str], clouds: str, namespace: str = "", requested: Iterable[str] = ()
+    types: Mapping[str, str], clouds: str, namespace: str = "", requested_topics: Iterable[str] = ()
 ) -> dict[str, str]:
     """Select the box topics that belong to a cloud topic.
 
@@ -92,12 +92,12 @@ def select_box_topics(
 
     Args:
         types: Types of the published topics, by name.
-        requested: Topics of detections, empty for all.
+        requested_topics: Topics of detections, empty for all.
 
     Returns:
         BOXES, TRACKS or LABELS for each selected topic.
     """
-    selected = {}
+    kind_by_topic = {}
     for topic, kind in types.items():
         if kind not in (MARKERS, ARRAY):
             continue
@@ -106,14 +106,14 @@ def select_box_topics(
             continue
         for suffix, box_kind in KIND_BY_SUFFIX.items():
             if marker_topic.endswith(suffix):
-                selected[topic] = box_kind
-    box_namespace = namespace or _infer_namespace(clouds, selected)
-    selected = {t: k for t, k in selected.items() if is_in_namespace(t, box_namespace)}
-    full_names = [resolve_topic(t, namespace) for t in requested]
+                kind_by_topic[topic] = box_kind
+    box_namespace = namespace or _infer_namespace(clouds, kind_by_topic)
+    kind_by_topic = {t: k for t, k in kind_by_topic.items() if is_in_namespace(t, box_namespace)}
+    full_names = [resolve_topic(t, namespace) for t in requested_topics]
     if full_names:
-        selected = {t: k for t, k in selected.items() if k != BOXES}
-        selected |= {t: BOXES for t in full_names if types.get(t) in (MARKERS, ARRAY)}
-    return selected
+        kind_by_topic = {t: k for t, k in kind_by_topic.items() if k != BOXES}
+        kind_by_topic |= {t: BOXES for t in full_names if types.get(t) in (MARKERS, ARRAY)}
+    return kind_by_topic
 
 
 def _infer_namespace(clouds: str, box_topics: Mapping[str, str]) -> str:

@@ -155,9 +155,9 @@ class LiveView(ExternalNode):
                 if clouds.last_time is None:
                     lines.append(f"no cloud has arrived on {self.clouds} yet")
         for topic, reception in self.receptions.items():
-            lost = reception.arrivals.lost + reception.arrivals.dropped
-            if topic != self.clouds and lost:
-                lines.append(f"{lost} of {reception.arrivals.sent} arrays on {topic} were lost")
+            lost_count = reception.arrivals.lost + reception.arrivals.dropped
+            if topic != self.clouds and lost_count:
+                lines.append(f"{lost_count} of {reception.arrivals.sent} arrays on {topic} were lost")
         if any(box_topic.tf_problem for box_topic in self.live.topics.values()) and not has_tf():
             lines.append(NO_TF)
         self.live.problems = [*lines, *self.decode_errors.values()]

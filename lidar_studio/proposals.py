@@ -133,14 +133,17 @@ def find_objects(
 
 def _find_people(survey: FrameSurvey, seeds: Sequence[SilhouetteSeed]) -> tuple[Detections, Array]:
     scores = compute_person_probabilities(survey, seeds)
-    likely = np.flatnonzero(scores >= MIN_CONFIDENCE)
+    likely_clusters = np.flatnonzero(scores >= MIN_CONFIDENCE)
     detections = survey.detections
     people = detections.boxes[np.isin(detections.class_ids, NOT_VEHICLE_IDS)]
     boxes = np.array(
-        [complete_box(b, find_usual_size(CLASSES[PEDESTRIAN])) for b in survey.boxes[likely].astype(np.float64)]
+        [
+            complete_box(b, find_usual_size(CLASSES[PEDESTRIAN]))
+            for b in survey.boxes[likely_clusters].astype(np.float64)
+        ]
     ).reshape(-1, 7)
     is_new = centre_distances(boxes, people).min(axis=1, initial=np.inf) > SAME_OBJECT_DISTANCE_M
-    objects = detections.concatenate(Detections.of(boxes[is_new], PEDESTRIAN, scores[likely][is_new]))
+    objects = detections.concatenate(Detections.of(boxes[is_new], PEDESTRIAN, scores[likely_clusters][is_new]))
     return objects, np.arange(len(objects)) >= len(detections)
 
 
@@ -154,13 +157,15 @@ def _add_similar_objects(
     scores = np.array([compute_size_similarity(survey.shapes, seed.size) for seed in seeds])
     scores *= UNDETECTED_WEIGHT if request.has_detections else 1.0
     best_seed = scores.argmax(axis=0)
-    likely = np.flatnonzero(scores.max(axis=0) >= MIN_CONFIDENCE)
-    shapes = survey.shapes[likely].astype(np.float64)
-    boxes = np.array([complete_box(b, seeds[best_seed[k]].size) for k, b in zip(likely, shapes)]).reshape(-1, 7)
+    likely_clusters = np.flatnonzero(scores.max(axis=0) >= MIN_CONFIDENCE)
+    shapes = survey.shapes[likely_clusters].astype(np.float64)
+    boxes = np.array([complete_box(b, seeds[best_seed[k]].size) for k, b in zip(likely_clusters, shapes)]).reshape(
+        -1, 7
+    )
     min_distances = np.maximum(SAME_OBJECT_DISTANCE_M, boxes[:, None, 3] / 3)
     is_new = (centre_distances(boxes, objects.boxes) > min_distances).all(axis=1)
-    classes = np.array([CLASSES.index(seeds[k].class_name) for k in best_seed[likely]], np.int32)
-    new_objects = Detections.of(boxes[is_new], classes[is_new], scores.max(axis=0)[likely][is_new])
+    classes = np.array([CLASSES.index(seeds[k].class_name) for k in best_seed[likely_clusters]], np.int32)
+    new_objects = Detections.of(boxes[is_new], classes[is_new], scores.max(axis=0)[likely_clusters][is_new])
     return objects.concatenate(new_objects), np.append(is_candidate, np.ones(int(is_new.sum()), bool))
 
 

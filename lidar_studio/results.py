@@ -132,7 +132,7 @@ def match_detections(
     Returns:
         Indices: `missed` and `ignored_labels` of labels, `false` and `ignored` of detections.
     """
-    missed, false_positives, true_positives = [], [], []
+    missed_labels, false_positives, true_positives = [], [], []
     true_names = np.array([SIMILAR_CLASS[CLASSES[c]] for c in truth.class_ids], object)
     for name in classes & DETECTED.keys():
         labels = np.flatnonzero(true_names == name)
@@ -145,16 +145,16 @@ def match_detections(
             can_match |= distances <= MAX_CENTRE_DISTANCE
         i, j = assign_pairs(1.0 - overlaps, can_match) if can_match.size else (np.zeros(0, int), np.zeros(0, int))
         is_same_class = truth.class_ids[labels] == CLASSES.index(name)
-        missed += labels[is_same_class & ~np.isin(np.arange(len(labels)), j)].tolist()
+        missed_labels += labels[is_same_class & ~np.isin(np.arange(len(labels)), j)].tolist()
         true_positives += rows[i[is_same_class[j]]].tolist()
-        unmatched = np.delete(rows, i)
-        if camera is not None and len(unmatched):
-            unmatched = unmatched[camera.in_view(detections.boxes[unmatched, :3])]
-        false_positives += unmatched.tolist()
+        unmatched_rows = np.delete(rows, i)
+        if camera is not None and len(unmatched_rows):
+            unmatched_rows = unmatched_rows[camera.in_view(detections.boxes[unmatched_rows, :3])]
+        false_positives += unmatched_rows.tolist()
     scored_classes = [CLASSES.index(name) for name in classes & DETECTED.keys()]
     scored_rows = np.flatnonzero(detections.scores >= min_score)
     return {
-        "missed": sorted(missed),
+        "missed": sorted(missed_labels),
         "false": sorted(false_positives),
         "ignored_labels": np.flatnonzero(~np.isin(truth.class_ids, scored_classes)).tolist(),
         "ignored": np.setdiff1d(scored_rows, [*true_positives, *false_positives]).tolist(),
@@ -197,8 +197,8 @@ def choose_points_topic(path: Path) -> str:
     Raises InputError if the choice is ambiguous.
     """
     with Bag(path) as bag:
-        clustered = [topic for topic in CLUSTERED_TOPICS if bag.counts.get(topic)]
-        return clustered[0] if clustered else choose_cloud_topic(bag)
+        clustered_topics = [topic for topic in CLUSTERED_TOPICS if bag.counts.get(topic)]
+        return clustered_topics[0] if clustered_topics else choose_cloud_topic(bag)
 
 
 def read_recorded_results(poses: BagPoses, stamps: list[int]) -> Results:

@@ -75,7 +75,7 @@ class Session:
         self.busy: dict[str, Any] | None = None
         self.has_proposals = any(line.get("do") == "propose" for line in journal.lines)
         # Cancellation of the running task, and of the next task, which waits for the running one to end.
-        self._cancelled = self._next_cancelled = threading.Event()
+        self._cancel_event = self._next_cancel_event = threading.Event()
         self._worker: threading.Thread | None = None
         self._task = ""  # name of the worker's task, "" once it has ended
         self._lock, self._export_lock = threading.RLock(), threading.Lock()
@@ -110,15 +110,15 @@ class Session:
 
     def cancel(self) -> int:
         """Cancel the background task; return the number of the last action."""
-        self._cancelled.set()
-        self._next_cancelled.set()
+        self._cancel_event.set()
+        self._next_cancel_event.set()
         return self.state.seq
 
-    def start_proposals(self, page_id: str = "", again: bool = False) -> int:
+    def start_proposals(self, page_id: str = "", is_requested: bool = False) -> int:
         """Survey the drive in the background, and propose tracks if there are no proposals yet.
 
         Args:
-            again: True if a person requested new proposals.
+            is_requested: True if a person requested new proposals.
 
         Returns:
             The number of the last action.
@@ -131,21 +131,21 @@ class Session:
                 raise InputError("proposals are already being computed; wait until they are finished, or cancel them")
             self._start(
                 "proposing tracks",
-                lambda: self.propose(page_id, again=again or not self.has_proposals, by_person=again),
+                lambda: self.propose(page_id, recompute=is_requested or not self.has_proposals, by_person=is_requested),
             )
         return self.state.seq
 
     def _start(self, task: str, run_task: Callable[[], None]) -> None:
         """Cancel the previous task and run a new task in a thread."""
         self.cancel()
-        previous, cancelled, self._task = self._worker, threading.Event(), task
-        self._next_cancelled = cancelled
+        previous_worker, cancel_event, self._task = self._worker, threading.Event(), task
+        self._next_cancel_event = cancel_event
 
         def run() -> None:
-            if previous is not None:
-                previous.join()
+            if previous_worker is not None:
+                previous_worker.join()
             self.busy = {"what": task, "done": 0, "of": len(self.drive.frames)}
-            self._cancelled = cancelled  # may already be set
+            self._cancel_event = cancel_event  # may already be set
             try:
                 run_task()
             except InputError as error:
@@ -167,11 +167,11 @@ class Session:
         if self._worker is not None:
             self._worker.join()
 
-    def propose(self, page_id: str = "", again: bool = True, by_person: bool = False) -> None:
+    def propose(self, page_id: str = "", recompute: bool = True, by_person: bool = False) -> None:
         """Survey the drive if necessary, and record proposals unless the task is cancelled.
 
         Args:
-            again: If False, compute proposals only if a clicked object still has to be tracked.
+            recompute: If False, compute proposals only if a clicked object still has to be tracked.
             by_person: True if a person requested the proposals and can undo them.
 
         Raises:
@@ -180,14 +180,14 @@ class Session:
         self.proposer.load_cached()
         self._report_problem()
         if self.proposer.surveys is None:
-            complete = self.proposer.run_survey(self._report_progress)
+            is_complete = self.proposer.run_survey(self._report_progress)
             self._report_problem()
-            if not complete:
+            if not is_complete:
                 return
         with self._lock:
             if not self.state.poses and (poses := self.proposer.collect_scan_poses()) is not None:
                 self._record({"do": "poses", "poses": poses}, page_id)
-        if again or self._has_waiting_clicks():
+        if recompute or self._has_waiting_clicks():
             self._propose_all(page_id, None, by_person)
 
     def _report_problem(self) -> None:
@@ -200,7 +200,7 @@ class Session:
         if self.busy is not None:
             self.busy = {**self.busy, "done": count}
             self.notify({"progress": self.get_progress()})
-        return not self._cancelled.is_set()
+        return not self._cancel_event.is_set()
 
     def _propose_all(self, page_id: str, seed: int | None, by_person: bool = False) -> None:
         """Compute proposals for the whole drive and record them.
@@ -211,7 +211,11 @@ class Session:
         state = self.state
         proposals = self.proposer.make_proposals(state, self.motion, None, self._report_progress)
         with self._lock:
-            if proposals is None or self._cancelled.is_set() or (seed is not None and not self._has_waiting_clicks()):
+            if (
+                proposals is None
+                or self._cancel_event.is_set()
+                or (seed is not None and not self._has_waiting_clicks())
+            ):
                 return
             tracks, removed_ids = merge_proposals(self.state, proposals, self.motion)
             # Undoing a click also undoes its proposals, but never the first proposals of a drive.
@@ -320,12 +324,12 @@ class Session:
     def _record(self, action: Action, page_id: str) -> int:
         """Apply an action, write it to the journal, notify the listeners, and return its number."""
         new_state, change = apply(self.state, action, self.drive.motion)
-        encoded: dict[int, dict[str, Any]] = {}
+        encoded_tracks: dict[int, dict[str, Any]] = {}
 
         def encode(track: Track) -> dict[str, Any]:
-            if track.id not in encoded:
-                encoded[track.id] = track_to_json(track)
-            return encoded[track.id]
+            if track.id not in encoded_tracks:
+                encoded_tracks[track.id] = track_to_json(track)
+            return encoded_tracks[track.id]
 
         line = {"seq": new_state.seq, "time": datetime.now(UTC).isoformat(), "by": page_id}
         self.journal.append({**line, **convert_tracks(action, encode)})

@@ -63,12 +63,12 @@ def snap_to_cluster(scan: Scan, box: Array) -> Array:
 
     Raises InputError if there is no cluster in the box.
     """
-    inside = points_in_box(scan.xyz, box, BOX_MARGIN_M) & (scan.cluster_ids > 0)
-    counts = np.bincount(scan.cluster_ids[inside], minlength=scan.cluster_ids.max(initial=0) + 1)
+    is_inside = points_in_box(scan.xyz, box, BOX_MARGIN_M) & (scan.cluster_ids > 0)
+    counts = np.bincount(scan.cluster_ids[is_inside], minlength=scan.cluster_ids.max(initial=0) + 1)
     if not counts.any():
         raise InputError("no cluster in the box; move the box onto a cluster")
     is_large = counts >= MIN_PART_FRACTION * counts.max()
-    return align_heading(_fit_box(scan, inside & is_large[scan.cluster_ids]), box[6])
+    return align_heading(_fit_box(scan, is_inside & is_large[scan.cluster_ids]), box[6])
 
 
 def snap_to_ground(scan: Scan, box: Array) -> Array:

@@ -216,12 +216,12 @@ def find_next_uncertain(
 def count_progress(state: State, frames: int) -> dict[str, int]:
     """Count the tracks by state, the checked frames and the actions."""
     states = [t.state for t in state.tracks.values()]
-    accepted, rejected = states.count(ACCEPTED), states.count(REJECTED)
+    accepted_count, rejected_count = states.count(ACCEPTED), states.count(REJECTED)
     return {
         "tracks": len(states),
-        "accepted": accepted,
-        "rejected": rejected,
-        "left": len(states) - accepted - rejected,
+        "accepted": accepted_count,
+        "rejected": rejected_count,
+        "left": len(states) - accepted_count - rejected_count,
         "frames": frames,
         "checked": len(state.checked_frames),
         "actions": state.seq,

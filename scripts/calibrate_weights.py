@@ -54,9 +54,10 @@ def main(scans: Path, weights: tuple[Path, ...], jobs: int, limit: int | None) -
         )
         calibrations = fit_calibrations(Comparison.concatenate(report.frames)) if report.frames else {}
         header = read_header(path)
-        if missing := sorted({*header.calibration} - {*calibrations}):
+        if missing_classes := sorted({*header.calibration} - {*calibrations}):
             raise click.ClickException(
-                f"{path} is not changed: {scans} has too few correct or wrong detections of {', '.join(missing)}"
+                f"{path} is not changed: {scans} has too few correct or wrong detections of "
+                + ", ".join(missing_classes)
             )
         save_header(path, replace(header, calibration=calibrations))
         console.print(f"{path.name}: {calibrations}")

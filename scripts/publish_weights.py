@@ -87,7 +87,7 @@ def describe_weights(header: checkpoint.Header, title: str) -> list[str]:
     training, config = header.training, header.config
     low, high = getattr(config, "low", None), getattr(config, "high", None)
     sensor = training.get("sensor", EARLY_SENSOR)  # empty for scans of several sensors
-    init, others = training.get("init"), training["validation_scenes"]
+    init, validation_scenes = training.get("init"), training["validation_scenes"]
     if init:
         init = (
             "earlier shipped weights"
@@ -99,13 +99,13 @@ def describe_weights(header: checkpoint.Header, title: str) -> list[str]:
         f"Network: {header.network} {config.title}".rstrip() + "; the header of the file has the full config.",
         *([CLASSIFIER_NOTE] if title == Path(CLASSIFIER).stem else []),
         f"Training data: {', '.join(training['data'])}, {training['scenes']} scenes; "
-        + (f"validation on {others} others." if others else "no validation.")
+        + (f"validation on {validation_scenes} others." if validation_scenes else "no validation.")
         + (" Simulated streets only, no real scan." if training["data"] == ["sim"] else ""),
         f"Training: {training['steps']} steps of {training['batch']} scenes in "
         f"{training['seconds'] / 60:.0f} minutes, seed {training['seed']}{start}.",
         *(
-            f"Mean of these and earlier weights ({other['steps']} steps, commit {other['commit']})."
-            for other in training.get("mean_with", ())
+            f"Mean of these and earlier weights ({earlier['steps']} steps, commit {earlier['commit']})."
+            for earlier in training.get("mean_with", ())
         ),
         f"Commit: {header.commit}.",
         f"Classes: {', '.join(config.classes)}.",

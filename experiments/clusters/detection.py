@@ -79,13 +79,13 @@ def measure_detection(frame: Frame, models: Mapping[str, TrainedModel]) -> dict[
         )
 
     detections, times = detect(Change(), list_sources(models))
-    changed = {name: detect(change, list_compared_sources(models)) for name, change in CHANGES.items()}
+    changed_results = {name: detect(change, list_compared_sources(models)) for name, change in CHANGES.items()}
     return {
         "truth": to_record(to_camera_objects(truth, calibration)),
         "found": detections,
-        "changed": {name: boxes for name, (boxes, _) in changed.items()},
+        "changed": {name: boxes for name, (boxes, _) in changed_results.items()},
         "detector_ms": times,
-        "changed_ms": {name: ms for name, (_, ms) in changed.items()},
+        "changed_ms": {name: ms for name, (_, ms) in changed_results.items()},
     }
 
 

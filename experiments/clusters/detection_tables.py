@@ -88,8 +88,8 @@ def _average_seeds(draws: Draws) -> dict[str, np.ndarray]:
     return {network: np.mean(cells, axis=0) for network, cells in cells_by_network.items()}
 
 
-def _make_map_cells(draws: np.ndarray, published: float | None = None) -> tuple[Cell, ...]:
-    return make_cells(estimate(draws[:, :, MEAN]), (published, None))
+def _make_map_cells(draws: np.ndarray, published_value: float | None = None) -> tuple[Cell, ...]:
+    return make_cells(estimate(draws[:, :, MEAN]), (published_value, None))
 
 
 def _make_gain_cells(draws: Draws, network: str, reference: str) -> Row:
@@ -102,12 +102,12 @@ def _make_gain_cells(draws: Draws, network: str, reference: str) -> Row:
 
 
 def _make_ablation_section(draws: Draws, data: str, models: Mapping[str, TrainedModel]) -> Section:
-    def make_row(network: str, reference: str, published: float | None) -> Row:
+    def make_row(network: str, reference: str, published_value: float | None) -> Row:
         trained_models = [m for name, m in models.items() if name.startswith(f"{network}, seed ")]
         minutes = float(np.mean([m.seconds for m in trained_models])) / 60
         return (
             network,
-            *_make_map_cells(draws[network], published),
+            *_make_map_cells(draws[network], published_value),
             *_make_gain_cells(draws, network, reference),
             Cell(minutes, paper=paper.MINUTES[data].get(network)),
             str(trained_models[0].parameters),
@@ -156,11 +156,11 @@ def _make_ablation_section(draws: Draws, data: str, models: Mapping[str, Trained
 
 
 def _make_radii_section(draws: Draws, data: str) -> Section:
-    published, nds = paper.TABLE_4[data]
+    published_map, nds = paper.TABLE_4[data]
     rows: list[Row] = [
         (
             f"{radii} m",
-            *_make_map_cells(draws[name], published if name == OURS else None),
+            *_make_map_cells(draws[name], published_map if name == OURS else None),
             *_make_gain_cells(draws, name, OURS),
             Cell(None, paper=nds if name == OURS else None),
         )
@@ -186,11 +186,11 @@ def _make_difficulty_section(draws: Draws, data: str) -> Section:
     class_rows: list[Row] = []
     for network in (name for name in COMPARED if name in draws):
         cells = draws[network][:, :, :MEAN].reshape(-1, 2, len(SCORED), len(DIFFICULTIES))
-        published = paper.TABLE_6.get(network, (None,) * 4) if data == "KITTI" else (None,) * 4
+        published_values = paper.TABLE_6.get(network, (None,) * 4) if data == "KITTI" else (None,) * 4
         for protocol, title in enumerate(MAP):
             means = np.concatenate([_average_classes(cells[:, protocol]), draws[network][:, protocol, MEAN:]], axis=1)
             level_rows.append(
-                (network, title, *make_cells(estimate(means), published if protocol == STRICT_3D else ()))
+                (network, title, *make_cells(estimate(means), published_values if protocol == STRICT_3D else ()))
             )
         for i, name in enumerate(SCORED):
             class_values = paper.FIGURE_10.get(network, {}).get(name, (None,) * 3)
@@ -239,7 +239,7 @@ def _make_change_section(
 ) -> Section:
     rows: list[Row] = []
     for network in (name for name in COMPARED if name in draws):
-        published = paper.TABLE_8[data].get(network, {})
+        published_values = paper.TABLE_8[data].get(network, {})
         model, all_points = name_model(network, 0), draws[network]
         for change in ("all points", *CHANGES):
             cells = all_points if change == "all points" else changed_draws[change][network]
@@ -257,7 +257,7 @@ def _make_change_section(
                 (
                     network,
                     change,
-                    *_make_map_cells(cells, published.get(change)),
+                    *_make_map_cells(cells, published_values.get(change)),
                     *make_cells(estimate(retention[:, RELAXED_BEV:])),
                     Cell(None if np.isnan(ms) else ms),
                     "yes" if ms <= MAX_MS else "no",

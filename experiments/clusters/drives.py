@@ -183,8 +183,8 @@ def make_drive_section(records: list[dict[str, Any]], data: str) -> Section:
                 [compute_scores([truth[i] for i in sample], [boxes[i] for i in sample]) for sample in samples]
             )
             has_published = network == OURS and boxes is detections
-            published = [paper.TABLE_7.get(score) for score in SCORES] if has_published else ()
-            rows.append((network, title, *make_cells(estimate(draws), published, DIGITS)))
+            published_values = [paper.TABLE_7.get(score) for score in SCORES] if has_published else ()
+            rows.append((network, title, *make_cells(estimate(draws), published_values, DIGITS)))
     source = "nuScenes" if data == "nuScenes" else f"{SIMULATED_DRIVES} simulated drives"
     return Section(
         "Scores of nuScenes (Table 7)",

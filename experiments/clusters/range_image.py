@@ -62,8 +62,15 @@ def cluster_range_image(xyz: np.ndarray, params: RangeImageParams = RangeImagePa
     image = np.full((row.max() + 1, columns), -1)
     image.ravel()[filled_pixels] = np.arange(len(filled_pixels))
     pairs = [
-        _link_pixels(image, xyz[nearest].astype(np.float64), ranges[nearest], down, right, np.radians(params.min_angle))
-        for down, right in NEIGHBOUR_OFFSETS
+        _link_pixels(
+            image,
+            xyz[nearest].astype(np.float64),
+            ranges[nearest],
+            row_offset,
+            column_offset,
+            np.radians(params.min_angle),
+        )
+        for row_offset, column_offset in NEIGHBOUR_OFFSETS
     ]
     a, b = np.concatenate(pairs, axis=1)
     graph = coo_matrix((np.ones(len(a), bool), (a, b)), (len(filled_pixels), len(filled_pixels)))
@@ -75,10 +82,10 @@ def cluster_range_image(xyz: np.ndarray, params: RangeImageParams = RangeImagePa
 
 
 def _link_pixels(
-    image: np.ndarray, xyz: np.ndarray, ranges: np.ndarray, down: int, right: int, min_angle: float
+    image: np.ndarray, xyz: np.ndarray, ranges: np.ndarray, row_offset: int, column_offset: int, min_angle: float
 ) -> np.ndarray:
     """Return pairs (2, E) of linked pixels that are `down` rows and `right` columns apart."""
-    a, b = image[: len(image) - down], np.roll(image, -right, axis=1)[down:]
+    a, b = image[: len(image) - row_offset], np.roll(image, -column_offset, axis=1)[row_offset:]
     is_pair = (a >= 0) & (b >= 0)
     a, b = a[is_pair], b[is_pair]
     long_ranges, short_ranges = np.maximum(ranges[a], ranges[b]), np.minimum(ranges[a], ranges[b])

@@ -179,10 +179,10 @@ def pair_clusters(ids: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
     """
     in_both = (ids > 0) & (owner > 0)
     width = int(ids.max(initial=0)) + 1
-    keys, common = np.unique(owner[in_both] * width + ids[in_both], return_counts=True)
+    keys, common_points = np.unique(owner[in_both] * width + ids[in_both], return_counts=True)
     object_ids, cluster_ids = np.divmod(keys, width)
     cluster_sizes, object_sizes = np.bincount(ids, minlength=width), np.bincount(owner, minlength=count + 1)
-    iou = common / (cluster_sizes[cluster_ids] + object_sizes[object_ids] - common)
+    iou = common_points / (cluster_sizes[cluster_ids] + object_sizes[object_ids] - common_points)
     cluster_by_object, is_paired = np.zeros(count, np.int64), np.zeros(width, bool)
     for k in np.argsort(-iou, kind="stable"):
         if cluster_by_object[object_ids[k] - 1] == 0 and not is_paired[cluster_ids[k]]:

@@ -44,10 +44,10 @@ def make_segmentation_sections(records: list[dict[str, Any]], data: str) -> list
 
 def compute_scores(sums: np.ndarray) -> np.ndarray:
     """Compute SCORES (..., 5) from sums of COUNT_COLUMNS (..., 9)."""
-    points, right, right_object, found_object, true_object, *_ = np.moveaxis(sums, -1, 0)
+    points, correct, right_object, found_object, true_object, *_ = np.moveaxis(sums, -1, 0)
     return 100 * np.stack(
         [
-            divide(right, points),
+            divide(correct, points),
             divide(right_object, found_object),
             divide(right_object, true_object),
             divide(2 * right_object, found_object + true_object),
@@ -59,18 +59,18 @@ def compute_scores(sums: np.ndarray) -> np.ndarray:
 
 def compute_object_scores(sums: np.ndarray) -> np.ndarray:
     """Compute recall, precision, F1 and mean IoU of objects (..., 4) in percent from sums of COUNT_COLUMNS."""
-    objects, hits, judged, iou = np.moveaxis(sums[..., 5:], -1, 0)
-    rates = compute_rates(hits, judged - hits, objects - hits)
+    objects, hits, clusters, iou = np.moveaxis(sums[..., 5:], -1, 0)
+    rates = compute_rates(hits, clusters - hits, objects - hits)
     return np.concatenate([rates, 100 * divide(iou, objects)[..., None]], axis=-1)
 
 
 def _make_methods_section(records: list[dict], data: str) -> Section:
     counts = {name: stack_counts([r["methods"][name] for r in records], len(COUNT_COLUMNS)) for name in METHODS}
-    published = paper.SEGMENTATION[data]
+    published_values = paper.SEGMENTATION[data]
     point_rows: list[Row] = []
     object_rows: list[Row] = []
     for name, method_counts in counts.items():
-        values = published.get(PUBLISHED.get(name, ""), (None,) * 6)
+        values = published_values.get(PUBLISHED.get(name, ""), (None,) * 6)
         paired_counts = np.stack([method_counts, counts[REFERENCE]], axis=1)
         p = compute_paired_p(paired_counts, compute_object_scores)[MEAN_IOU]
         times = _bootstrap_times([[r["ms"][name], r["ms"]["ground"] + r["ms"][name]] for r in records], 2)
@@ -101,7 +101,7 @@ def _make_methods_section(records: list[dict], data: str) -> Section:
             "",
             Cell(None, paper=values[5]),
         )
-        for name, values in published.items()
+        for name, values in published_values.items()
         if name not in PUBLISHED.values()
     ]
     note = (
@@ -146,7 +146,7 @@ def _make_methods_section(records: list[dict], data: str) -> Section:
 def _make_sweeps_section(records: list[dict], data: str) -> Section:
     rows: list[Row] = []
     panels = []
-    published = paper.SEGMENTATION[data]["ours"]
+    published_values = paper.SEGMENTATION[data]["ours"]
     for name in SWEEPS:
         values = getattr(STUDY, name)
         estimates = []
@@ -154,7 +154,7 @@ def _make_sweeps_section(records: list[dict], data: str) -> Section:
             key = f"{name} {value:g}"
             counts = stack_counts([r["sweeps"][key] for r in records], len(COUNT_COLUMNS))
             estimates.append(bootstrap(counts, compute_scores)[:, IOU])
-            iou, ms = (published[4], published[5]) if value == paper.BEST[name] else (None, None)
+            iou, ms = (published_values[4], published_values[5]) if value == paper.BEST[name] else (None, None)
             times = _bootstrap_times([[r["ms"]["ground"] + r["ms"][key]] for r in records], 1)
             rows.append((f"{name} = {value:g}", *make_cells(estimates[-1][:, None], [iou]), *make_cells(times, [ms])))
         lines = (

@@ -176,14 +176,16 @@ def _make_seeded_contender(
 
     Without a camera it runs on the full scan, as the other detectors do.
     """
-    uncropped = with_values(params, {"view.enabled": False})
+    uncropped_params = with_values(params, {"view.enabled": False})
 
     def make_detector(frame: Frame) -> Detector | None:
         seed, camera = find_seed(frame), frame.camera()
         return (
             None
             if seed is None
-            else CandidateDetector(seed, camera, uncropped if camera is None else params).with_min_score(MIN_SCORE)
+            else CandidateDetector(seed, camera, uncropped_params if camera is None else params).with_min_score(
+                MIN_SCORE
+            )
         )
 
     threshold = CandidateDetector(_raise_no_seed, None, params).min_scores[PERSON]

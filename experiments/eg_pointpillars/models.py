@@ -77,7 +77,7 @@ def name_model(version: str, fraction: float, seed: int) -> str:
 def group_seeds(models: Mapping[str, TrainedModel]) -> dict[tuple[str, float], list[str]]:
     """Group networks that differ only in the seed: (version, fraction of the labels) -> names."""
     groups: dict[tuple[str, float], list[str]] = {}
-    for name, trained in models.items():
-        params: Any = trained.model.params
-        groups.setdefault((params.version, trained.model.label_share), []).append(name)
+    for name, trained_model in models.items():
+        params: Any = trained_model.model.params
+        groups.setdefault((params.version, trained_model.model.label_share), []).append(name)
     return groups

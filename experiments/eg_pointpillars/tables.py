@@ -161,13 +161,13 @@ def make_table_5(draws: Draws, labels: list[dict[str, Any]]) -> Section:
         "p values are from bootstrap samples of the frames, the same for all versions, so that differences "
         "are paired. The paper does not say which recall points it uses."
     )
-    if few := [name for name, count in counts.items() if count < MIN_LABELS]:
-        text += f" There are too few labels to compare versions by the AP of {', '.join(few)} or by the mean."
-    best = max((values[0, RELAXED, MEAN] for values in draws.values()), default=np.nan)
-    if not best >= MIN_AP:  # also true for NaN
+    if rare_classes := [name for name, count in counts.items() if count < MIN_LABELS]:
+        text += f" There are too few labels to compare versions by the AP of {', '.join(rare_classes)} or by the mean."
+    best_ap = max((values[0, RELAXED, MEAN] for values in draws.values()), default=np.nan)
+    if not best_ap >= MIN_AP:  # also true for NaN
         text = (
             "No version was trained long enough, or the frames have too few objects (mean BEV "
-            f"AP {best:.1f}), so neither the versions nor the numbers of labels can be compared. " + text
+            f"AP {best_ap:.1f}), so neither the versions nor the numbers of labels can be compared. " + text
         )
     return Section("Versions (Table 5)", text, tuple(tables))
 
@@ -184,8 +184,8 @@ def count_labels(labels: list[dict[str, Any]]) -> dict[str, int]:
 def _make_version_cells(draws: Draws, version: str, index: int) -> tuple[Cell, ...]:
     version_draws = draws[version, 1.0][:, index]
     is_strict = index == STRICT
-    published = [paper.TABLE_5[version][name][i % 3] for i, (name, _) in enumerate(CELLS)]
-    cells = make_cells(estimate(version_draws), [*published, paper.MAP[version]] if is_strict else ())
+    published_values = [paper.TABLE_5[version][name][i % 3] for i, (name, _) in enumerate(CELLS)]
+    cells = make_cells(estimate(version_draws), [*published_values, paper.MAP[version]] if is_strict else ())
     if version == "v0" or ("v0", 1.0) not in draws:
         return (*cells, Cell(None), Cell(None))
     gain = version_draws[:, MEAN] - draws["v0", 1.0][:, index, MEAN]

@@ -229,9 +229,7 @@ def _split_words(words: tuple[str, ...], data: Path | None) -> tuple[str, Path]:
     paths = words[experiment_name is not None :]
     name = Choice(EXPERIMENTS).convert(experiment_name or next(iter(EXPERIMENTS)), None, None)
     if len(paths) + (data is not None) > 1:
-        raise click.UsageError(
-            f"DATA is given twice, {' '.join(paths)}" + (f" and --data {data}" if data else "") + "; give one"
-        )
+        raise click.UsageError(f"expected one DATA, got {' '.join(paths)}" + (f" and --data {data}" if data else ""))
     if not paths and data is None:
         raise click.UsageError("DATA is missing: give the path of a recording, or `sim`")
     return name, data or Path(paths[0])

@@ -42,8 +42,8 @@ def bootstrap(
     """
     counts = np.asarray(counts, np.float64)
     frames, shape = len(counts), counts.shape[1:]
-    flat = counts.reshape(frames, int(np.prod(shape)))
-    value = np.asarray(compute(flat.sum(axis=0).reshape(shape)), np.float64)
+    flat_counts = counts.reshape(frames, int(np.prod(shape)))
+    value = np.asarray(compute(flat_counts.sum(axis=0).reshape(shape)), np.float64)
     if frames == 0:
         return np.stack([value, np.full(value.shape, np.nan), np.full(value.shape, np.nan)])
     rng, replicates = np.random.default_rng(params.seed), []
@@ -53,7 +53,7 @@ def bootstrap(
         # Number of times each frame was drawn, used as the weight of its counts.
         indices = rng.integers(frames, size=(rows, frames)) + frames * np.arange(rows)[:, None]
         weights = np.bincount(indices.ravel(), minlength=rows * frames).reshape(rows, frames)
-        replicates.append(compute((weights @ flat).reshape(rows, *shape)))
+        replicates.append(compute((weights @ flat_counts).reshape(rows, *shape)))
     limits = _compute_limits(np.concatenate(replicates), params.level)
     return np.stack([value, *np.where(np.isnan(value), np.nan, limits)])
 
@@ -76,23 +76,23 @@ def compute_paired_p(
     """
     counts = np.asarray(counts, np.float64)
     frames, shape = len(counts), counts.shape[2:]
-    flat = counts.reshape(frames, 2, int(np.prod(shape)))
-    total, swap_change = flat.sum(axis=(0, 1)), flat[:, 0] - flat[:, 1]
+    flat_counts = counts.reshape(frames, 2, int(np.prod(shape)))
+    total, swap_change = flat_counts.sum(axis=(0, 1)), flat_counts[:, 0] - flat_counts[:, 1]
 
     def compute_difference(first_sums: np.ndarray) -> np.ndarray:
         rows = first_sums.shape[:-1]
         return compute(first_sums.reshape(*rows, *shape)) - compute((total - first_sums).reshape(*rows, *shape))
 
-    observed = np.abs(compute_difference(flat[:, 0].sum(axis=0)))
+    observed_difference = np.abs(compute_difference(flat_counts[:, 0].sum(axis=0)))
     if frames == 0:
-        return np.full(observed.shape, np.nan)
-    rng, count_at_least = np.random.default_rng(params.seed), np.ones(observed.shape)
+        return np.full(observed_difference.shape, np.nan)
+    rng, count_at_least = np.random.default_rng(params.seed), np.ones(observed_difference.shape)
     batch_size = max(1, MAX_DRAWS // frames)
     for start in range(0, params.replicates, batch_size):
         is_swapped = rng.random((min(batch_size, params.replicates - start), frames)) < 0.5
-        differences = np.abs(compute_difference(flat[:, 0].sum(axis=0) - is_swapped @ swap_change))
-        count_at_least += (differences >= observed - 1e-12).sum(axis=0)
-    return np.where(np.isnan(observed), np.nan, count_at_least / (params.replicates + 1))
+        differences = np.abs(compute_difference(flat_counts[:, 0].sum(axis=0) - is_swapped @ swap_change))
+        count_at_least += (differences >= observed_difference - 1e-12).sum(axis=0)
+    return np.where(np.isnan(observed_difference), np.nan, count_at_least / (params.replicates + 1))
 
 
 def estimate(draws: np.ndarray, level: float = BootstrapParams.level) -> np.ndarray:

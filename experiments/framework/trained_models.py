@@ -187,7 +187,7 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
     errors.print("benchmarking this machine on a few scenes of each network ...")
     models = request.models(params, 0)
     speed_by_params: dict[Any, Speed] = {}
-    reduced: dict[str, Any] = {}
+    reduced_range: dict[str, Any] = {}
     data = None
     for model in models:
         key = replace(model.params, seed=0)
@@ -203,10 +203,12 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
             sources = planner.open_few_scenes()
             speed_by_params[key] = planner.measure_speed(*sources)
             if model.label_share == 1.0 and data is None:
-                data, reduced = planner.count_scenes(*sources), trainer.find_reduced_range(params)
+                data, reduced_range = planner.count_scenes(*sources), trainer.find_reduced_range(params)
     assert data is not None, "an experiment requires a model that is trained with all labels"
     speeds = {model.name: speed_by_params[replace(model.params, seed=0)] for model in models}
-    user_plan = Plan(params.data.scans, params.data.val_scans, 0, params.steps, params.validate_steps, bool(reduced))
+    user_plan = Plan(
+        params.data.scans, params.data.val_scans, 0, params.steps, params.validate_steps, bool(reduced_range)
+    )
 
     def fit_seeds(seeds: int) -> Plan:
         hours = request.budget or DEFAULT_BUDGET_H
@@ -245,7 +247,7 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
         "validate_steps": plan.validate_steps,
         "data.scans": plan.scans,
         "data.val_scans": plan.val_scans,
-        **(reduced if plan.part else {}),
+        **(reduced_range if plan.part else {}),
     }
     durations = {name: sum(estimate_training_durations(plan, speed, data)) for name, speed in speeds.items()}
     errors.print(

@@ -91,9 +91,9 @@ def count_detections(labelled_cloud: LabelledCloud, detections: Detections) -> d
         is_matched = np.zeros(len(labels), bool)
         false_positives = 0
         for row, box in zip(distances, class_detections.boxes):
-            unmatched = np.flatnonzero((row <= limit) & ~is_matched)
-            if len(unmatched):
-                is_matched[unmatched[row[unmatched].argmin()]] = True
+            unmatched_labels = np.flatnonzero((row <= limit) & ~is_matched)
+            if len(unmatched_labels):
+                is_matched[unmatched_labels[row[unmatched_labels].argmin()]] = True
             elif np.hypot(box[0], box[1]) < MAX_RANGE_M and not (row <= limit).any():
                 false_positives += 1
         true_positives = int((is_matched & is_counted[labels]).sum())

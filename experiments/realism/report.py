@@ -45,13 +45,13 @@ def _print_curves(content: dict, console: Console) -> None:
     )
     judged_curves = [c for c in content["curves"].values() if c["judged"]]
     for curve in sorted(judged_curves, key=lambda c: (c["share"], -(find_typical_factor(c) or 0.0))):
-        worst = max((b for b in curve["bins"] if b["within"] is not None), key=compute_factor)
+        worst_bin = max((b for b in curve["bins"] if b["within"] is not None), key=compute_factor)
         table.add_row(
             _format_title(curve),
             f"{curve['within']} of {curve['judged']}",
             format_number(find_typical_factor(curve), width=9),
-            worst["bin"],
-            format_number(worst["ratio"], width=9),
+            worst_bin["bin"],
+            format_number(worst_bin["ratio"], width=9),
         )
     unjudged_count = sum(not curve["judged"] for curve in content["curves"].values())
     table.caption = (

@@ -90,8 +90,8 @@ def score_boxes(candidates: ScoredBoxes, truth: np.ndarray) -> dict[str, list]:
         `ranked`, with [score, 1 for a hit or 0] of every candidate. For `ranked`, candidates are
         matched regardless of their scores, so that each pedestrian has at most one hit.
     """
-    accepted = candidates.accepted
-    counts = count_by_range(accepted, truth, match_centres(accepted, truth))
+    boxes = candidates.accepted
+    counts = count_by_range(boxes, truth, match_centres(boxes, truth))
     is_hit = np.isin(np.arange(len(candidates.boxes)), match_centres(candidates.boxes, truth)[0])
     return {
         **{name: count.tolist() for name, count in zip(COUNTS, counts)},
@@ -204,14 +204,14 @@ def _make_section(title: str, names: Sequence[str], records: list[dict[str, Any]
     )
 
 
-def find_best_f1(ranked: list[list], label_count: float) -> float | None:
+def find_best_f1(ranked_candidates: list[list], label_count: float) -> float | None:
     """Return the best F1 over all thresholds, in percent; None if there are no pedestrians.
 
     Args:
-        ranked: `ranked` of score_boxes() for each frame.
+        ranked_candidates: `ranked` of score_boxes() for each frame.
         label_count: Number of labelled pedestrians.
     """
-    pairs = np.array([pair for frame in ranked for pair in frame], float).reshape(-1, 2)
+    pairs = np.array([pair for frame in ranked_candidates for pair in frame], float).reshape(-1, 2)
     if label_count == 0:
         return None
     order = np.argsort(-pairs[:, 0], kind="stable")

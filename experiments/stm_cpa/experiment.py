@@ -51,13 +51,13 @@ def measure_frame(frames: Sequence[Frame], number: int) -> dict[str, Any]:
     labelled = load_labelled_frame(frame)
     truth = labelled.pedestrians
     segmented = labelled.segment(PAPER)
-    seed, no_seed, candidates, unfiltered = None, None, Candidates.none(), Candidates.none()
+    seed, no_seed, candidates, unfiltered_candidates = None, None, Candidates.none(), Candidates.none()
     sweep = [candidates.final.boxes] * (NUMBERS.cpa_steps + 1)
     readings = dict.fromkeys(READINGS, candidates.final.boxes)
     try:
         seed = make_nearest_seed(segmented, labelled)
         candidates = _refine(segmented, seed, PAPER)
-        unfiltered = _refine(segmented, seed, drop_height_filter())
+        unfiltered_candidates = _refine(segmented, seed, drop_height_filter())
         sweep = [_refine(segmented, seed, extend_cpa(steps)).final.boxes for steps in range(NUMBERS.cpa_steps + 1)]
         readings = {name: _refine(segmented, seed, params).final.boxes for name, params in READINGS.items()}
     except InputError as error:
@@ -68,13 +68,13 @@ def measure_frame(frames: Sequence[Frame], number: int) -> dict[str, Any]:
         "pedestrians": _count_by_range(truth),
         "no_seed": no_seed,
         "stages": {stage: count_stage(boxes[stage], truth, boxes["stage1"]) for stage in STAGES},
-        "cpa": [count_stage(accepted, truth, boxes["stage1"]) for accepted in sweep],
-        "readings": {name: count_stage(accepted, truth, boxes["stage1"]) for name, accepted in readings.items()},
+        "cpa": [count_stage(stage_boxes, truth, boxes["stage1"]) for stage_boxes in sweep],
+        "readings": {name: count_stage(stage_boxes, truth, boxes["stage1"]) for name, stage_boxes in readings.items()},
         "pointpillars": count_stage(detect_pedestrians(labelled), truth, boxes["stage1"]),
         "overlap": {stage: measure_overlaps(boxes[stage], truth) for stage in STAGES},
         "search": search_clustering(segmented, seed, truth),
-        "clusters": [len(unfiltered.stage1), len(candidates.stage1)],
-        "ms": None if no_seed else {**segmented.ms, **candidates.ms, "stm_all": unfiltered.ms["stm"]},
+        "clusters": [len(unfiltered_candidates.stage1), len(candidates.stage1)],
+        "ms": None if no_seed else {**segmented.ms, **candidates.ms, "stm_all": unfiltered_candidates.ms["stm"]},
     }
 
 

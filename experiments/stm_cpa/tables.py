@@ -49,14 +49,14 @@ def make_sections(records: list[dict[str, Any]]) -> list[Section]:
 def _make_truth_section(records: list[dict]) -> Section:
     counts = stack_counts([r["pedestrians"] for r in records], len(RANGE_NAMES))
     percentages = bootstrap(counts, lambda sums: 100 * divide(sums, sums.sum(axis=-1, keepdims=True)))
-    published = list(paper.TABLE_1.values())
+    published_values = list(paper.TABLE_1.values())
     rows: list[Row] = [
         (name, Cell(float(count), paper=paper_count, digits=0), percentage)
         for name, count, paper_count, percentage in zip(
             RANGE_NAMES,
             counts.sum(axis=0),
-            published,
-            make_cells(percentages, [100 * n / paper.PEDESTRIANS for n in published]),
+            published_values,
+            make_cells(percentages, [100 * n / paper.PEDESTRIANS for n in published_values]),
         )
     ]
     rows.append(("all", Cell(float(counts.sum()), paper=paper.PEDESTRIANS, digits=0), ""))
@@ -135,9 +135,13 @@ def _make_cpa_section(records: list[dict]) -> Section:
     for k in steps:
         counts = _stack_scores(records, [r["cpa"][k] for r in records])
         estimates.append(bootstrap(counts, _compute_scores))
-        published = paper.TABLE_5[k] if k < len(paper.TABLE_5) else ()
+        published_values = paper.TABLE_5[k] if k < len(paper.TABLE_5) else ()
         rows.append(
-            (str(k), *_make_score_cells(estimates[-1][:, -1], published), *_format_counts(counts.sum(axis=(0, 2))))
+            (
+                str(k),
+                *_make_score_cells(estimates[-1][:, -1], published_values),
+                *_format_counts(counts.sum(axis=(0, 2))),
+            )
         )
     stacked_estimates = np.stack(estimates, axis=1)  # (3, steps, ranges, scores)
     ranges = f"{NUMBERS.cpa_min_range:g} to {NUMBERS.cpa_max_range:g} m"
@@ -238,12 +242,12 @@ def _make_runtime_section(records: list[dict]) -> Section:
     timed_records = [r for r in records if r["ms"]]
     mean_rows: list[Row] = []
     median_rows: list[Row] = []
-    for name, published in paper.TABLE_9.items():
+    for name, published_values in paper.TABLE_9.items():
         ms = stack_counts([_list_step_times(r["ms"], name) for r in timed_records], len(STEPS))
         estimates = bootstrap(
             np.column_stack([np.ones(len(ms)), ms]), lambda sums: divide(sums[..., 1:], sums[..., :1])
         )
-        mean_rows.append((name, *make_cells(estimates, published, 2)))
+        mean_rows.append((name, *make_cells(estimates, published_values, 2)))
         medians = np.median(ms, axis=0) if len(ms) else np.full(len(STEPS), np.nan)
         median_rows.append((name, *(Cell(value, digits=2) for value in nan_to_none(medians))))
     clusters = stack_counts([r["clusters"] for r in timed_records], 2).sum(axis=0) / max(len(timed_records), 1)
@@ -297,15 +301,15 @@ def _compute_scores(sums: np.ndarray) -> np.ndarray:
     return np.concatenate([compute_rates(tp, fp, fn), kept_and_error], axis=-1)
 
 
-def _make_score_row(title: str, records: list[dict], counts: list[dict], published: tuple) -> Row:
+def _make_score_row(title: str, records: list[dict], counts: list[dict], published_values: tuple) -> Row:
     """Return the row of a method over all ranges. `counts` has the counts of each frame."""
-    stacked = _stack_scores(records, counts)
-    scores = bootstrap(stacked, _compute_scores)[:, -1]
-    return title, *_make_score_cells(scores, published), *_format_counts(stacked.sum(axis=(0, 2)))
+    stacked_counts = _stack_scores(records, counts)
+    scores = bootstrap(stacked_counts, _compute_scores)[:, -1]
+    return title, *_make_score_cells(scores, published_values), *_format_counts(stacked_counts.sum(axis=(0, 2)))
 
 
-def _make_score_cells(estimates: np.ndarray, published: tuple) -> tuple[Cell, ...]:
-    return make_cells(estimates, published, DIGITS)
+def _make_score_cells(estimates: np.ndarray, published_values: tuple) -> tuple[Cell, ...]:
+    return make_cells(estimates, published_values, DIGITS)
 
 
 def _format_counts(sums: np.ndarray) -> tuple[str, ...]:

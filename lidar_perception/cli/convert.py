@@ -122,7 +122,9 @@ def convert(
     ):
         if is_invalid:
             raise click.UsageError(message)
-    recording = open_and_describe(source if data is None else data, level=robot is None, split=split, points=points)
+    recording = open_and_describe(
+        source if data is None else data, check_mount=robot is None, split=split, points=points
+    )
     transform = _make_frame_transform(recording, robot, deskew)
     if converts_labels:
         _convert_labels(source, recording, format, out, labels_format, data is not None, detections, limit, force)
@@ -211,8 +213,8 @@ def _convert_to_bag(
     count = min(len(recording), limit or len(recording))
     skipped: list[str] = []
     frames = show_progress(map(transform, islice(recording, count)), f"converting {source}", count)
-    written = write_bag(out, frames, images=images, force=force, skipped=skipped)
-    console.print(f"{out}: {written} scans of {count}")
+    written_count = write_bag(out, frames, images=images, force=force, skipped=skipped)
+    console.print(f"{out}: {written_count} scans of {count}")
     for line in skipped:
         console.print(Text("left out", "yellow") + f": {line}")
     raise SystemExit(1 if skipped else 0)
@@ -274,7 +276,7 @@ def _convert_labels(
         labels = import_labels(source, labels_format or recognise_format(source), recording.frames)
     else:
         labels = DriveLabels(list(map(read_frame_labels, recording.frames[:])))
-    written = export_labels(labels.take_first(count), format, out, recording.frames[:count], force)
-    console.print(f"{out}: {written.boxes} boxes of {written.frames} frames, as {format}")
-    for content in written.left_out:
+    export = export_labels(labels.take_first(count), format, out, recording.frames[:count], force)
+    console.print(f"{out}: {export.boxes} boxes of {export.frames} frames, as {format}")
+    for content in export.left_out:
         console.print(f"left out: {content}, which the format cannot store", style="yellow")

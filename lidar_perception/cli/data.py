@@ -84,11 +84,13 @@ def data_argument(
     several: bool = False,
     value_type: Any = click.Path(path_type=Path),
 ) -> Callable:
-    """Decorator: the argument DATA, and --data as another way to give it.
+    """Return a decorator that adds the argument DATA, and the option --data with the same meaning.
+
+    The decorated function receives the value as `data`.
 
     Args:
         description: help of --data.
-        required: True if one of them must be given; otherwise the function gets data=None, or ().
+        required: True if one of the two must be given; otherwise `data` may be None, or ().
         several: True to accept any number of values, as a tuple.
         value_type: type of a value.
     """
@@ -100,7 +102,7 @@ def data_argument(
                 argument_text, option_text = (
                     " ".join(map(str, value if several else [value])) for value in (data, data_option)
                 )
-                raise click.UsageError(f"DATA is given twice, {argument_text} and --data {option_text}; give one")
+                raise click.UsageError(f"expected one DATA, got {argument_text} and --data {option_text}")
             if required and not (data or data_option):
                 raise click.UsageError("DATA is missing: give the path of a recording")
             return function(*args, data=data or data_option, **kwargs)
@@ -167,7 +169,7 @@ browser_option = click.option(
 
 @dataclass(frozen=True)
 class ScoringOptions:
-    """Options of all commands that score frames: the frames, the processes and the output file."""
+    """Options shared by the commands that score frames."""
 
     data: Any  # one path, or a list of paths
     split: Path | None
@@ -213,11 +215,12 @@ def refuse_jobs_with_dask(has_jobs: bool, dask: str | None) -> None:
 
 
 def scoring_options(data: Callable = data_argument(), *, parallel: bool = True) -> Callable:
-    """Decorator: DATA, --split, --limit, --jobs, --dask and --json, which the function gets as
-    options=ScoringOptions(...).
+    """Return a decorator that adds DATA, --split, --limit, --jobs, --dask and --json.
+
+    The decorated function receives them as `options`, a ScoringOptions.
 
     Args:
-        data: argument DATA.
+        data: decorator that adds DATA.
         parallel: False to leave out --jobs and --dask.
     """
 
@@ -236,13 +239,13 @@ def scoring_options(data: Callable = data_argument(), *, parallel: bool = True) 
     return decorate
 
 
-def open_and_describe(data: Path, *, level: bool = True, **open_args: Any) -> Any:
+def open_and_describe(data: Path, *, check_mount: bool = True, **open_args: Any) -> Any:
     """Open a recording (see data.open.open_recording) and print its summary.
 
     If the recording does not state the sensor height, it is measured on the first clouds.
 
     Args:
-        level: True to report a tilted sensor and the scale of the intensity.
+        check_mount: True to report a tilted sensor and the scale of the intensity.
     """
     from lidar_perception.data.mount_check import apply_measured_height, find_mount_problem, load_first_clouds
     from lidar_perception.data.open import open_recording
@@ -257,7 +260,7 @@ def open_and_describe(data: Path, *, level: bool = True, **open_args: Any) -> An
     if recording_with_height is not recording:
         height = next(iter(recording_with_height)).sensor_height
         errors.print(f"sensor height {height:.2f} m, measured on the first clouds", style="dim")
-    if level and clouds:
+    if check_mount and clouds:
         if (full_scale := recording.frames[0].intensity_max()) > 1:
             errors.print(f"intensity 0 .. {full_scale:g}, read as 0 .. 1", style="dim")
         for problem in filter(

@@ -56,8 +56,8 @@ from msg_utils.markers import from_marker_array
 from msg_utils.stamps import to_ns
 
 RECORD = "demo.json"  # file in the output folder that names the data and the detector
-BEHIND_M = 2.0  # a detection farther behind the sensor than this requires an all-around picture
-REPLACED = ("drive", "result", "logs")  # subfolders that the next demo replaces
+MAX_BEHIND_M = 2.0  # the picture shows all directions if a detection is farther behind the sensor
+REPLACED_FOLDERS = ("drive", "result", "logs")  # subfolders that the next demo replaces
 
 
 def _make_algorithm(detector: str) -> Algorithm:
@@ -149,12 +149,12 @@ def demo(
     make_folder(out / "logs")
     with compile_in_background(_write_compile_code(choice), out / "logs" / "compile.log", errors.print):
         drive = _make_drive_bag(out / "drive", recording, frames, drive_seed)
-    replayed = _open_replayed_bag(drive, recording)
-    clouds = len(replayed)
+    replayed_bag = _open_replayed_bag(drive, recording)
+    clouds = len(replayed_bag)
     from lidar_perception.nodes.replay.graph_replay import TRACKS, replay
 
     with errors.status("loading compiled code (the first time: compiling, half a minute or more)"):
-        node_params = _load_node_params(choice, replayed)
+        node_params = _load_node_params(choice, replayed_bag)
     content = replay(
         drive,
         clouds,
@@ -166,9 +166,9 @@ def demo(
         real_time=real_time,
         processes=processes,
     )
-    final = list_result_topics(single, detector)[FINAL_STAGE]
-    detections, tracks = read_results(out / "result", final, TRACKS)
-    calibration = next(iter(replayed)).calibration()
+    final_topic = list_result_topics(single, detector)[FINAL_STAGE]
+    detections, tracks = read_results(out / "result", final_topic, TRACKS)
+    calibration = next(iter(replayed_bag)).calibration()
     if detector == CANDIDATES:
         print_candidate_report(content, console)
     else:
@@ -180,13 +180,13 @@ def demo(
         out,
         find_result_cloud_topic(single, detector),
         _select_drawn_objects(detections, detector),
-        next(iter(replayed)).sensor_height,
+        next(iter(replayed_bag)).sensor_height,
     )
     console.print(f"results in {out}: result (bag), scores.json, logs" + (", birdseye.png" if has_picture else ""))
     console.print(f"show it: lidar-perception view {out / 'result'}")
-    if missing := clouds - content["results"]:
+    if missing_count := clouds - content["results"]:
         errors.print(
-            Text(f"{missing} clouds produced no result", "red")
+            Text(f"{missing_count} clouds produced no result", "red")
             + ("; without --real-time, no cloud is dropped" if real_time else f"; see {out}/logs")
         )
         if not real_time:
@@ -199,7 +199,7 @@ def _remove_old_results(out: Path, data: Path | None, detector: str) -> None:
     Raises:
         InputError: `out` holds other files.
     """
-    old_folders = [out / name for name in REPLACED if (out / name).exists()]
+    old_folders = [out / name for name in REPLACED_FOLDERS if (out / name).exists()]
     if old_folders and not (out / RECORD).is_file():
         raise InputError(
             f"{old_folders[0]} exists without a {RECORD}, so demo did not create it; remove it, or give another --out"
@@ -217,12 +217,12 @@ def _open_replayed_bag(path: Path, recording: Recording | None) -> Recording:
     return open_recording(path, sensor_height=None if recording is None else recording.frames[0].sensor_height)
 
 
-def _load_node_params(choice: DetectorChoice, replayed: Recording) -> Any:
+def _load_node_params(choice: DetectorChoice, replayed_bag: Recording) -> Any:
     """Return the parameters of the nodes, and compile their shared code once for all of them."""
     if choice.weights == CANDIDATES:
         warm_up()
-        return with_recorded_setup(replayed, apply_values(PAPER, choice.settings))
-    return choice.open(sensor_height=replayed.frames[0].sensor_height).params
+        return with_recorded_setup(replayed_bag, apply_values(PAPER, choice.settings))
+    return choice.open(sensor_height=replayed_bag.frames[0].sensor_height).params
 
 
 def _write_compile_code(choice: DetectorChoice) -> str:
@@ -361,7 +361,7 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
         [str(i) if trails else "" for i in detections.ids],
         [trails.get(int(i), detections.boxes[k : k + 1, :3]) for k, i in enumerate(detections.ids)],
     )
-    stage = Stage.of(frame, height, not (detections.boxes[:, 0] < -BEHIND_M).any())
+    stage = Stage.of(frame, height, not (detections.boxes[:, 0] < -MAX_BEHIND_M).any())
     write_png(
         out / "birdseye.png",
         draw_frame(

@@ -122,7 +122,9 @@ def settings_options(
     example: str = "fused.scores.car=0.7",
     candidates: bool = False,
 ) -> Callable:
-    """Decorator: --config and --set, which the function gets as settings=Settings(...).
+    """Return a decorator that adds --config and --set.
+
+    The decorated function receives them as `settings`, a Settings.
 
     Args:
         select: returns the algorithms that the options select, for `--set help`.
@@ -180,9 +182,15 @@ def parameter_options(
     nodes: Collection[str] | None = CANDIDATE_NODES,
     example: str = "stm.threshold=0.5",
 ) -> Callable:
-    """Return a decorator that adds --config and --set for a dataclass of parameters.
+    """Return a decorator that adds --config and --set for a parameter dataclass.
 
-    The function gets the dataclass as params=...
+    The decorated function receives the resulting dataclass as `params`.
+
+    Args:
+        defaults: dataclass with the default values.
+        name: name of the algorithm in messages.
+        nodes: nodes whose sections of a parameter file apply; None: all.
+        example: assignment to show in the help.
     """
     algorithm = Algorithm(name, _drop_input_fields(collect_fields(defaults)), nodes)
 
@@ -258,14 +266,15 @@ device_option = click.option(
 
 
 def detector_options(*, default: str | None = FUSED, tracking: bool = False) -> Callable:
-    """Decorator: --weights, --range, --device, --config and --set, which the function gets as
-    detector=DetectorChoice(...).
+    """Return a decorator that adds --weights, --range, --device, --config and --set.
+
+    The decorated function receives them as `detector`, a DetectorChoice.
 
     Args:
-        default: detector without --weights. If None, the function gets detector=None. It also gets
-            None if the command has an option --results and that is given.
-        tracking: True to accept parameters of the tracker as well; the function gets them as
-            tracking=TrackingParams(...).
+        default: detector without --weights; if None, `detector` may be None. `detector` is also None
+            if the command has an option --results and it is given.
+        tracking: True to accept parameters of the tracker as well. The function receives them as
+            `tracking`, a TrackingParams.
     """
     tracker = [TRACKER] if tracking else []
 
@@ -303,10 +312,10 @@ def detector_options(*, default: str | None = FUSED, tracking: bool = False) -> 
 
 
 def detectors_options(function: Callable) -> Callable:
-    """Decorator: the options of detector_options for any number of detectors.
+    """Add the options of detector_options for any number of detectors.
 
-    The function gets them as detectors=(DetectorChoice(...), ...). Each parameter of --set must
-    belong to at least one of them.
+    The decorated function receives them as `detectors`, a tuple of DetectorChoice. Each parameter of
+    --set must belong to at least one of them.
     """
 
     @functools.wraps(function)

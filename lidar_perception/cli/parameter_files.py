@@ -42,23 +42,25 @@ def read_parameters(
     """
     if str(path) in CONFIGURATIONS:
         configuration = CONFIGURATIONS[str(path)]
-        if others := sorted(configuration.keys() - fields.keys()):
-            raise InputError(f"the configuration {path} is for candidates, not {others[0]}; give a parameter file")
+        if foreign_names := sorted(configuration.keys() - fields.keys()):
+            raise InputError(
+                f"the configuration {path} is for candidates, not {foreign_names[0]}; give a parameter file"
+            )
         return dict(configuration), []
     content = _load_file(path)
-    visited = count()
+    entry_count = count()
     values: dict[str, Any] = {}
-    lines: list[str] = []
-    unknown: list[str] = []
+    warnings: list[str] = []
+    unknown_names: list[str] = []
     for node, section in content.items():
         if not (isinstance(section, dict) and isinstance(section.get("ros__parameters", ()), dict | None)):
             raise InputError(f"{path}: '{node}' has no ros__parameters; see config/ for examples")
         if nodes is not None and not _is_for_nodes(str(node), nodes):
             name = str(node).rpartition("/")[2]
             if name not in NODES and (suggestion := suggest_name(name, nodes)):
-                lines.append(f"unknown node {name[:80]!r}{suggestion}")
+                warnings.append(f"unknown node {name[:80]!r}{suggestion}")
             continue
-        for name, value in _iterate_dotted(path, section.get("ros__parameters") or {}, visited):
+        for name, value in _iterate_dotted(path, section.get("ros__parameters") or {}, entry_count):
             if not isinstance(name, str):
                 raise InputError(f"{path}: {name!r} is not a parameter name; quote it")
             if name in fields:
@@ -66,8 +68,8 @@ def read_parameters(
             elif any(k.startswith(f"{name}.") or name.startswith(f"{k}.") for k in fields):
                 raise InputError(f"{path}: '{name}' is {_describe_wrong_level(name, fields)}")
             else:
-                unknown.append(name)
-    return values, [*lines, *describe_misspelt_parameters(unknown)]
+                unknown_names.append(name)
+    return values, [*warnings, *describe_misspelt_parameters(unknown_names)]
 
 
 def _load_file(path: Path) -> dict[Any, Any]:
@@ -94,24 +96,26 @@ def _describe_wrong_level(name: str, names: Iterable[str]) -> str:
     return (
         f"a group, not a value; it contains {', '.join(members)}"
         if members
-        else "below a parameter that is not a group"
+        else "nested in a parameter that is not a group"
     )
 
 
 def _iterate_dotted(
-    path: Path, section: dict, visited: Iterator[int], prefix: str = "", depth: int = 0
+    path: Path, section: dict, entry_count: Iterator[int], prefix: str = "", depth: int = 0
 ) -> Iterator[tuple[Any, Any]]:
     """Yield (dotted name, value); a name that is not a string is yielded unchanged.
 
-    `visited` counts the entries of all groups, because YAML anchors can nest groups endlessly.
+    `entry_count` counts the entries of all groups, because YAML anchors can nest groups endlessly.
     """
     for key, value in section.items():
-        if next(visited) >= MAX_NAMES or depth >= MAX_DEPTH:
-            raise InputError(f"{path} has more than {MAX_NAMES} parameters, or more than {MAX_DEPTH} nested groups")
+        if next(entry_count) >= MAX_NAMES or depth >= MAX_DEPTH:
+            raise InputError(
+                f"{path} is too large: at most {MAX_NAMES} parameters and {MAX_DEPTH} levels of nesting are supported"
+            )
         if not isinstance(key, str):
             yield key, value
         elif isinstance(value, dict):
-            yield from _iterate_dotted(path, value, visited, f"{prefix}{key}.", depth + 1)
+            yield from _iterate_dotted(path, value, entry_count, f"{prefix}{key}.", depth + 1)
         else:
             yield f"{prefix}{key}", value
 

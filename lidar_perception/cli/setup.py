@@ -54,9 +54,9 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
       lidar-perception simulate --sensor robot/sensor.yaml --out street
       lidar-perception run fused_detector --ros-args --params-file robot/robot.param.yaml
     """
-    existing = [name for name in FILES if (out / name).exists()]
-    if existing and not force:
-        raise InputError(f"{out / existing[0]} already exists; give another folder or --force")
+    existing_files = [name for name in FILES if (out / name).exists()]
+    if existing_files and not force:
+        raise InputError(f"{out / existing_files[0]} already exists; give another folder or --force")
     from lidar_perception.data.raw_clouds import choose_clouds, open_clouds
     from lidar_perception.sensor_setup.measurement.measure import measure_sensor
     from lidar_perception.sensor_setup.measurement.recorded_poses import read_recorded_poses

@@ -174,10 +174,10 @@ def _write_dataset(
     )
     was_complete, has_started = resume and is_finished(out), False
     try:
-        with make_resumable_folder(out, settings, FOLDERS, resume=resume, force=force) as missing:
+        with make_resumable_folder(out, settings, FOLDERS, resume=resume, force=force) as missing_frames:
             has_started = True
-            with closing(write_frames(out, plan, missing, jobs)) as written:
-                for _ in show_progress(written, "simulating", len(missing)):
+            with closing(write_frames(out, plan, missing_frames, jobs)) as written_frames:
+                for _ in show_progress(written_frames, "simulating", len(missing_frames)):
                     pass
     except InputError as error:
         if not has_started:
@@ -187,5 +187,5 @@ def _write_dataset(
         f"{out} is already complete"
         if was_complete
         else f"{out}: {plan.frames} scans"
-        + (f", {plan.frames - len(missing)} of them from the interrupted run" if resume else "")
+        + (f", {plan.frames - len(missing_frames)} of them from the interrupted run" if resume else "")
     )

@@ -55,7 +55,7 @@ OPTIONS = (
 
 
 def shared_options(function: Callable) -> Callable:
-    """Decorator: the options shared by all networks; the command gets them as request=..."""
+    """Add the options shared by all networks. The command receives them as `request`, a TrainingRequest."""
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
@@ -68,9 +68,9 @@ def shared_options(function: Callable) -> Callable:
 
 
 def training_options(defaults: Any) -> Callable:
-    """Decorator: one flag for each training parameter, and --config and --set.
+    """Return a decorator that adds --config, --set and one flag for each training parameter.
 
-    The function gets params=...; flags take precedence.
+    The decorated function receives the result as `params`. Flags take precedence.
     """
     fields_by_name = collect_fields(defaults)
 

@@ -43,14 +43,14 @@ class FrameDetections(Generic[BoxesT]):
     problem: str | None = None
 
 
-def thin_scan(frame: PointCloud, fraction: float, name: str) -> PointCloud:
+def thin_scan(cloud: PointCloud, fraction: float, name: str) -> PointCloud:
     """Return a random fraction (0..1) of a frame's points to emulate a sparser sensor (paper C).
 
     The choice depends only on the frame's name. A smaller fraction is a subset of a larger one.
     """
     if fraction >= 1.0:
-        return frame
-    return frame.take(np.flatnonzero(draw_subset(len(frame), fraction, name)))
+        return cloud
+    return cloud.take(np.flatnonzero(draw_subset(len(cloud), fraction, name)))
 
 
 def draw_subset(count: int, fraction: float, name: str) -> np.ndarray:

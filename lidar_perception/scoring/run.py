@@ -103,10 +103,10 @@ def fill_journal(
     Raises:
         InputError: A process or the cluster failed.
     """
-    unfinished = [i for i, name in enumerate(names) if name not in journal.lines]
-    results = measure_frames(recording, start, unfinished, jobs=jobs, dask=dask)
+    unfinished_numbers = [i for i, name in enumerate(names) if name not in journal.lines]
+    results = measure_frames(recording, start, unfinished_numbers, jobs=jobs, dask=dask)
     with closing(results):
-        for i, line in show_progress(results, title, len(unfinished)):
+        for i, line in show_progress(results, title, len(unfinished_numbers)):
             journal.add(json.dumps({"frame": names[i], "skipped": str(line)}) if isinstance(line, SkipReason) else line)
 
 
@@ -140,22 +140,22 @@ def measure_frames(
 
 def sort_results(pairs: Iterable[tuple[int, Any]], numbers: Sequence[int]) -> Generator[tuple[int, Any]]:
     """Yield pairs (number, value) in the order of `numbers`, each as soon as it is available."""
-    finished: dict[int, Any] = {}
-    remaining = iter(numbers)
-    next_number = next(remaining, None)
+    finished_values: dict[int, Any] = {}
+    remaining_numbers = iter(numbers)
+    next_number = next(remaining_numbers, None)
     for number, value in pairs:
-        finished[number] = value
-        while next_number in finished:
-            yield next_number, finished.pop(next_number)
-            next_number = next(remaining, None)
+        finished_values[number] = value
+        while next_number in finished_values:
+            yield next_number, finished_values.pop(next_number)
+            next_number = next(remaining_numbers, None)
 
 
 def _measure_in_process(
     recording: Recording, start: StartMeasurement, numbers: Sequence[int]
 ) -> Generator[tuple[int, Any]]:
-    measure, selected = start(recording), set(numbers)
-    for i, frame in enumerate(islice(recording, max(selected, default=-1) + 1)):
-        if i in selected:
+    measure, selected_numbers = start(recording), set(numbers)
+    for i, frame in enumerate(islice(recording, max(selected_numbers, default=-1) + 1)):
+        if i in selected_numbers:
             yield i, _measure_safely(measure, frame)
 
 
@@ -215,14 +215,14 @@ def _measure_on_dask(
         ) from None
     with client:
         max_submitted = TASKS_PER_THREAD * sum(client.nthreads().values())
-        not_submitted = iter(numbers)
+        waiting_numbers = iter(numbers)
         futures = distributed.as_completed(
-            client.map(measure_on_worker, [*islice(not_submitted, max_submitted)], pure=False), loop=client.loop
+            client.map(measure_on_worker, [*islice(waiting_numbers, max_submitted)], pure=False), loop=client.loop
         )
         try:
             for future in futures:
                 yield future.result()
-                for number in islice(not_submitted, 1):
+                for number in islice(waiting_numbers, 1):
                     futures.add(client.submit(measure_on_worker, number, pure=False))
         except (distributed.KilledWorker, CommClosedError, CancelledError) as error:
             raise InputError(

@@ -236,7 +236,7 @@ def test_data_argument_and_data_option_are_equivalent(words, tmp_path, monkeypat
         assert exit_of(monkeypatch, *words, *value, *out, *results) == 2
         said[name] = capsys.readouterr().err.splitlines()[-1]
     assert said["argument"] == said["option"] and "none does not exist" in said["argument"]
-    assert "DATA is given twice" in said["both"]
+    assert "expected one DATA" in said["both"]
     assert "DATA is missing" in said.get("neither", "DATA is missing")
     assert not (tmp_path / "out").exists()
 

@@ -75,20 +75,20 @@ def test_set_takes_precedence_over_config(bag, tmp_path):
     "section, words",
     [
         ("stm: 5", "'stm' is a group, not a value; it contains stm.threshold"),
-        ("stm: {threshold: {of: 5}}", "'stm.threshold.of' is below a parameter"),
+        ("stm: {threshold: {of: 5}}", "'stm.threshold.of' is nested in a parameter"),
         ("5: 6", "5 is not a parameter name"),
         ("{stm: {on: 1}}", "True is not a parameter name"),
         ("[" * 700, "cannot read the parameter file"),
         ("a: 2001-99-99", "cannot read the param"),
         (
             "\n    ".join(["a0: &a0 {x: 1}"] + [f"a{i + 1}: &a{i + 1} {{x: *a{i}, y: *a{i}}}" for i in range(40)]),
-            "more than 10000 parameters",
+            "at most 10000 parameters",
         ),
         (
             "\n    ".join(["a0: &a0 {}"] + [f"a{i + 1}: &a{i + 1} {{x: *a{i}, y: *a{i}}}" for i in range(40)]),
-            "more than 10000 parameters",
+            "at most 10000 parameters",
         ),
-        ("&a {b: *a}", "more than 20 nested groups"),
+        ("&a {b: *a}", "20 levels of nesting"),
     ],
     ids=range(9),
 )

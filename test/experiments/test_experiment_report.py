@@ -106,7 +106,7 @@ def test_data_is_argument_or_option_but_not_both(tmp_path, monkeypatch, capsys):
         assert exit_of(monkeypatch, "reproduce", "stm-cpa", *words, "--out", tmp_path / "out", run=main) == 2
         errors.append(capsys.readouterr().err.splitlines()[-1])
     assert errors[0] == errors[1] and "none does not exist" in errors[0]
-    assert "DATA is given twice" in errors[2] and "DATA is missing" in errors[3]
+    assert "expected one DATA" in errors[2] and "DATA is missing" in errors[3]
     assert not (tmp_path / "out").exists()
 
 

@@ -226,7 +226,7 @@ def test_cloud_with_most_columns_and_its_boxes_are_selected():
         "/ground_truth/detections": LABELS,
     }
     assert select_box_topics({FOUND + "_3d": ARRAY}, "/points") == {FOUND + "_3d": BOXES}
-    assert select_box_topics(one, "/points", requested=["clustering/output/boxes"]) == {
+    assert select_box_topics(one, "/points", requested_topics=["clustering/output/boxes"]) == {
         "/clustering/output/boxes": BOXES,
         TRACKED: TRACKS,
         "/ground_truth/detections": LABELS,
@@ -241,7 +241,7 @@ def test_cloud_with_most_columns_and_its_boxes_are_selected():
     assert select_cloud_topic({"/velodyne_points": CLOUD, "/x": MARKERS}) == "/velodyne_points"
     for types, requested in (({}, ""), (one, "/no"), ({"/a": CLOUD, "/b": CLOUD}, "")):
         with pytest.raises(InputError) as error_info:
-            select_cloud_topic(types, requested=requested)
+            select_cloud_topic(types, requested_topic=requested)
         assert "\n" not in str(error_info.value)
 
 

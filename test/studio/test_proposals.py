@@ -233,7 +233,7 @@ def test_seed_corrected_before_tracking_is_tracked(drive, tmp_path, monkeypatch,
         session.execute({"do": "box", "track": track.id, "frame": 1, "box": moved_box})
         assert len(session.state.tracks[track.id].boxes) < FRAMES - 1
         if not is_restarted:
-            session.propose(again=False)
+            session.propose(recompute=False)
             track = session.state.tracks[track.id]
     if is_restarted:
         with open_session(drive, tmp_path, detector=None) as new_session:
@@ -328,7 +328,7 @@ def test_survey_is_cached_and_repeated_if_the_cache_is_damaged(drive, tmp_path):
         messages = []
         session.listeners.append(lambda event: messages.append(event.get("error", "")))
         assert session.has_proposals and session.proposer.surveys is None
-        session.propose(again=False)
+        session.propose(recompute=False)
         assert any("damaged" in line for line in messages) and session.proposer.surveys is not None
     with open_session(drive, tmp_path, detector=None) as session:
         assert session.proposer.surveys is not None

@@ -32,8 +32,8 @@ class MethodList(click.ParamType):
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple:
         names = value if isinstance(value, tuple) else tuple(str(value).split(","))
         methods = GROUND_METHODS + CLUSTERING_METHODS
-        if unknown := [name for name in names if name not in methods]:
-            self.fail(f"unknown method {unknown[0]!r}{list_valid_names(unknown[0], methods)}", param, ctx)
+        if unknown_names := [name for name in names if name not in methods]:
+            self.fail(f"unknown method {unknown_names[0]!r}{list_valid_names(unknown_names[0], methods)}", param, ctx)
         return names
 
 

@@ -25,16 +25,16 @@ def match_centres(
     return assign_pairs(distance, distance <= max_distance)  # NaN centres match nothing
 
 
-def assign_pairs(cost: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def assign_pairs(cost: np.ndarray, is_allowed_pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Assign rows to columns of a non-negative cost matrix (K, M).
 
     Only pairs with allowed (K, M) bool are assigned. The number of pairs is maximal; among these
     assignments, the total cost is minimal. Returns rows (P,) and columns (P,).
     """
     # A forbidden pair costs more than all allowed pairs together.
-    forbidden_cost = cost[allowed].max(initial=0.0) * cost.size + 1.0
-    rows, columns = linear_sum_assignment(np.where(allowed, cost, forbidden_cost))
-    is_allowed = allowed[rows, columns]
+    forbidden_cost = cost[is_allowed_pair].max(initial=0.0) * cost.size + 1.0
+    rows, columns = linear_sum_assignment(np.where(is_allowed_pair, cost, forbidden_cost))
+    is_allowed = is_allowed_pair[rows, columns]
     return rows[is_allowed], columns[is_allowed]
 
 

@@ -65,31 +65,31 @@ def measure_heights(frames: list[ComparedFrame], name: str) -> dict[str, Any]:
     return {"pairs": len(z_error), **{key: _compute_median(values) for key, values in rows.items()}}
 
 
-def diagnose_heights(name: str, rows: dict, matched: dict) -> str:
+def diagnose_heights(name: str, rows: dict, height_errors: dict) -> str:
     """Return a one-line diagnosis if a class is detected in BEV but not in 3D, otherwise "".
 
     Args:
         name: Name of the class.
         rows: Average precision of the class, as in DetectionReport.
-        matched: Result of measure_heights.
+        height_errors: Result of measure_heights.
     """
     for suffix in ("_relaxed", ""):
         bev, three_d = (rows[metric + suffix]["moderate"] for metric in ("bev", "3d"))
-        if matched["pairs"] and bev and bev["r40"] >= MIN_BEV_AP and three_d["r40"] * MIN_AP_RATIO <= bev["r40"]:
+        if height_errors["pairs"] and bev and bev["r40"] >= MIN_BEV_AP and three_d["r40"] * MIN_AP_RATIO <= bev["r40"]:
             return (
                 f"{name}: AP is {bev['r40']:.1f} in BEV but {three_d['r40']:.1f} in 3D "
                 f"(moderate, overlap {rows['bev' + suffix]['overlap']}): heights are wrong. "
-                + _describe_heights(matched)
+                + _describe_heights(height_errors)
             )
     return ""
 
 
-def _describe_heights(matched: dict) -> str:
-    z_error, height_error, height = (matched[key] for key in ("z_error_m", "height_error_m", "height_m"))
-    boxes = f"The {matched['pairs']} matched boxes are"
+def _describe_heights(height_errors: dict) -> str:
+    z_error, height_error, height = (height_errors[key] for key in ("z_error_m", "height_error_m", "height_m"))
+    boxes = f"The {height_errors['pairs']} matched boxes are"
     if abs(z_error) < MAX_MEDIAN_ERROR:
         return (
-            f"{boxes} {matched['abs_z_error_m']:.2f} m too high or too low, and {abs(height_error):.2f} m too "
+            f"{boxes} {height_errors['abs_z_error_m']:.2f} m too high or too low, and {abs(height_error):.2f} m too "
             f"{'tall' if height_error > 0 else 'short'} (medians)."
         )
     reason = "check the sensor height and the frame of the boxes."

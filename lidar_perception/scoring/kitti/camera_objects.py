@@ -96,9 +96,9 @@ def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> 
     if calibration is None:
         return _make_without_camera(objects, scores[: len(objects)])
     labels = to_labels(objects, calibration.lidar_to_camera)
-    projected, outside_fractions = np.zeros((len(labels), 4)), np.zeros(len(labels))
+    projected_boxes, outside_fractions = np.zeros((len(labels), 4)), np.zeros(len(labels))
     pixels, outside_fractions[: len(objects)] = project_boxes(objects.boxes, calibration)
-    projected[: len(objects)] = np.nan_to_num(pixels)
+    projected_boxes[: len(objects)] = np.nan_to_num(pixels)
 
     label_boxes = _read_columns(labels, "bbox", 4)
     has_pixels = (label_boxes[:, 2:] > label_boxes[:, :2]).all(axis=1, keepdims=True)
@@ -119,7 +119,7 @@ def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> 
                 -rotation_y - np.pi / 2,
             ]
         ),
-        image_boxes=np.where(has_pixels, label_boxes, projected),
+        image_boxes=np.where(has_pixels, label_boxes, projected_boxes),
         alpha=np.where(alpha > NO_ANGLE, alpha, computed_alpha),
         truncated=np.array([_compute_truncation(e, o) for e, o in zip(_list_extras(objects), outside_fractions)]),
         occluded=_read_columns(labels, "occluded").astype(int),

@@ -138,12 +138,12 @@ def count_confusions(
     """
     shape = len(classes) + 1, len(classes) + 1
     cluster_counts, point_counts = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
-    predicted = predictions.probabilities.argmax(axis=1)
+    predicted_classes = predictions.probabilities.argmax(axis=1)
     is_scored = (labels >= 0) & (clusters.sizes >= MIN_POINTS)
-    np.add.at(cluster_counts, (labels[is_scored], predicted[is_scored]), 1)
+    np.add.at(cluster_counts, (labels[is_scored], predicted_classes[is_scored]), 1)
     largest = max(int(cluster_ids.max(initial=0)), int(clusters.ids.max(initial=0)))
     class_of_id = np.full(largest + 1, len(classes))
-    class_of_id[clusters.ids] = predicted
+    class_of_id[clusters.ids] = predicted_classes
     is_labelled = point_truth >= 0
     np.add.at(point_counts, (point_truth[is_labelled], class_of_id[cluster_ids[is_labelled]]), 1)
     return cluster_counts, point_counts
@@ -175,15 +175,18 @@ def measure_network(weights: Path, settings: Mapping[str, Any], recording: Recor
         ids = cluster_obstacles(scan.xyz, ground, params.clustering)
         camera = frame.camera()
         if camera is None:  # labels cover all directions
-            indices, find_hidden = np.arange(len(scan)), lambda xyz: np.zeros(len(xyz), bool)
+            indices, find_unlabelled_points = np.arange(len(scan)), lambda xyz: np.zeros(len(xyz), bool)
         else:
-            indices, find_hidden = (np.flatnonzero(camera.in_view(scan.xyz)), partial(find_unlabelled, truth, camera))
+            indices, find_unlabelled_points = (
+                np.flatnonzero(camera.in_view(scan.xyz)),
+                partial(find_unlabelled, truth, camera),
+            )
         view_cloud, ids = scan.take(indices), ids[indices]
         clusters = make_clusters(view_cloud, ids, ground=ground[indices])
         labels, _ = label_clusters(clusters, truth.boxes, truth.class_ids, config.classes)
-        labels = set_unlabelled_to_unknown(labels, clusters, find_hidden(clusters.points[:, :3]), background)
+        labels = set_unlabelled_to_unknown(labels, clusters, find_unlabelled_points(clusters.points[:, :3]), background)
         point_labels = label_points(view_cloud.xyz, truth.boxes, truth.class_ids, config.classes)
-        point_labels[(point_labels == background) & find_hidden(view_cloud.xyz)] = UNKNOWN
+        point_labels[(point_labels == background) & find_unlabelled_points(view_cloud.xyz)] = UNKNOWN
         return count_confusions(clusters, labels, classifier.predict(clusters), point_labels, ids, config.classes)
 
     return measure
@@ -226,16 +229,16 @@ class ClusterScores:
 
 def _compute_scores(confusion: np.ndarray, classes: Sequence[str]) -> dict[str, Any]:
     """Compute accuracy, and precision, recall, F1 and IoU for each class and averaged over classes."""
-    correct = np.diag(confusion)
-    true, predicted = confusion.sum(axis=1), confusion.sum(axis=0)
+    correct_counts = np.diag(confusion)
+    true_counts, predicted_counts = confusion.sum(axis=1), confusion.sum(axis=0)
     rows = {}
     for i, name in enumerate(classes):
         rows[name] = {
-            "objects": int(true[i]),
-            "precision": _to_percent(correct[i], predicted[i]),
-            "recall": _to_percent(correct[i], true[i]),
-            "f1": _to_percent(2 * correct[i], true[i] + predicted[i]),
-            "iou": _to_percent(correct[i], true[i] + predicted[i] - correct[i]),
+            "objects": int(true_counts[i]),
+            "precision": _to_percent(correct_counts[i], predicted_counts[i]),
+            "recall": _to_percent(correct_counts[i], true_counts[i]),
+            "f1": _to_percent(2 * correct_counts[i], true_counts[i] + predicted_counts[i]),
+            "iou": _to_percent(correct_counts[i], true_counts[i] + predicted_counts[i] - correct_counts[i]),
         }
     present_rows = [row for row in rows.values() if row["objects"]]
     mean = {
@@ -245,8 +248,8 @@ def _compute_scores(confusion: np.ndarray, classes: Sequence[str]) -> dict[str, 
     count = len(classes)
     return {
         "confusion": confusion.tolist(),
-        "accuracy": _to_percent(correct.sum(), confusion.sum()),
-        "object_accuracy": _to_percent(correct[:count].sum(), true[:count].sum()),
+        "accuracy": _to_percent(correct_counts.sum(), confusion.sum()),
+        "object_accuracy": _to_percent(correct_counts[:count].sum(), true_counts[:count].sum()),
         "by_class": rows,
         "mean": mean,
     }

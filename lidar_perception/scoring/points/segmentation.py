@@ -53,15 +53,15 @@ def select_true_ground(semantic: np.ndarray, z: np.ndarray, protocol: str) -> tu
     return ground, is_counted
 
 
-def count_ground(predicted: np.ndarray, ground: np.ndarray, is_counted: np.ndarray) -> np.ndarray:
+def count_ground(predicted_ground: np.ndarray, ground: np.ndarray, is_counted: np.ndarray) -> np.ndarray:
     """Count true and false positives and negatives (4,) int64 [tp fp fn tn] of a ground mask (N,)."""
-    case = np.where(ground, np.where(predicted, 0, 2), np.where(predicted, 1, 3))
+    case = np.where(ground, np.where(predicted_ground, 0, 2), np.where(predicted_ground, 1, 3))
     return np.bincount(case.compress(is_counted), minlength=4)
 
 
-def count_by_protocol(predicted: np.ndarray, semantic: np.ndarray, z: np.ndarray) -> dict[str, np.ndarray]:
+def count_by_protocol(predicted_ground: np.ndarray, semantic: np.ndarray, z: np.ndarray) -> dict[str, np.ndarray]:
     """Return the result of count_ground for each protocol."""
-    return {name: count_ground(predicted, *select_true_ground(semantic, z, name)) for name in PROTOCOLS}
+    return {name: count_ground(predicted_ground, *select_true_ground(semantic, z, name)) for name in PROTOCOLS}
 
 
 def to_ground_row(counts: np.ndarray) -> dict:
@@ -265,17 +265,17 @@ class ClusterReport:
         ]
         overall = _to_object_row(*columns)
         clusters = sum(score.cluster_count for _, _, score in self.frames)
-        judged = sum(score.judged_count for _, _, score in self.frames)
+        judged_clusters = sum(score.judged_count for _, _, score in self.frames)
         hits = overall["hits"]
         return {
             "frames": len(self.frames),
             "ms": _compute_median(self.ms),
             "clusters": clusters,
             "clusters_per_frame": _divide(clusters, len(self.frames)),
-            "judged_clusters": judged,
+            "judged_clusters": judged_clusters,
             **overall,
-            "precision": _divide(hits, judged),
-            "f1": _divide(2 * hits, judged + overall["objects"]),
+            "precision": _divide(hits, judged_clusters),
+            "f1": _divide(2 * hits, judged_clusters + overall["objects"]),
             "by_class": {
                 str(name): _to_object_row(*(c[classes == name] for c in columns)) for name in np.unique(classes)
             },

@@ -61,11 +61,11 @@ def score_over_recall(sequences: list[list[Pairs]]) -> dict[str, float | None]:
         sequences: Frames of each sequence in order, as returned by make_pairs.
     """
     means = [_average_scores(frames) for frames in sequences]
-    matched = [[np.zeros(len(f.track_ids), bool) for f in frames] for frames in sequences]
+    has_matched = [[np.zeros(len(f.track_ids), bool) for f in frames] for frames in sequences]
     hits: list[float] = []
-    all_tracks = _count_at_threshold(sequences, means, matched, -np.inf, 1.0, hits)
+    all_tracks = _count_at_threshold(sequences, means, has_matched, -np.inf, 1.0, hits)
     points = [
-        _count_at_threshold(sequences, means, matched, threshold, recall, [])
+        _count_at_threshold(sequences, means, has_matched, threshold, recall, [])
         for threshold, recall in _choose_thresholds(np.array(hits), all_tracks.tp + all_tracks.fn)
     ]
     best = max(points, key=lambda p: p.mota, default=None)
@@ -104,7 +104,7 @@ def _choose_thresholds(scores: np.ndarray, objects: int) -> list[tuple[float, fl
 def _count_at_threshold(
     sequences: list[list[Pairs]],
     means: list[dict[int, float]],
-    matched: list[list[np.ndarray]],
+    has_matched: list[list[np.ndarray]],
     threshold: float,
     recall: float,
     hits: list[float],
@@ -116,16 +116,16 @@ def _count_at_threshold(
     """
     tp = fn = fp = switches = objects = 0
     overlap = 0.0
-    for frames, score, matched_frames in zip(sequences, means, matched):
+    for frames, score, sequence_has_matched in zip(sequences, means, has_matched):
         histories: dict[int, list[tuple[int, bool]]] = {}
-        for f, matched_once in zip(frames, matched_frames):
+        for f, track_has_matched in zip(frames, sequence_has_matched):
             mean_scores = np.array([score[i] for i in f.track_ids.tolist()])
             track_indices = np.flatnonzero(mean_scores >= threshold) if len(mean_scores) else np.zeros(0, int)
             rows, columns = _match(f.overlap[:, track_indices])
             columns = track_indices[columns]
-            matched_once[columns] = True
+            track_has_matched[columns] = True
             hits += mean_scores[columns].tolist()
-            is_excused = f.is_excused[track_indices] & ~matched_once[track_indices]
+            is_excused = f.is_excused[track_indices] & ~track_has_matched[track_indices]
             ignored_hits = int(f.is_ignored[rows].sum())
             label_count = int((~f.is_ignored).sum())
             objects += label_count
@@ -135,8 +135,8 @@ def _count_at_threshold(
             overlap += float(f.overlap[rows, columns].sum())
             ids = np.full(len(f.true_ids), -1, np.int64)
             ids[rows] = f.track_ids[columns]
-            for true_id, track, ignored in zip(f.true_ids.tolist(), ids.tolist(), f.is_ignored):
-                histories.setdefault(true_id, []).append((track, bool(ignored)))
+            for true_id, track, is_ignored in zip(f.true_ids.tolist(), ids.tolist(), f.is_ignored):
+                histories.setdefault(true_id, []).append((track, bool(is_ignored)))
         switches += sum(map(_count_switches, histories.values()))
     return RecallPoint(threshold, recall, tp, fn, fp, switches, objects, overlap)
 
@@ -155,10 +155,10 @@ def _count_switches(history: list[tuple[int, bool]]) -> int:
         history: Track id (-1 for none) and ignored flag, for each frame of the object.
     """
     count, last_track = 0, history[0][0]
-    if all(ignored for _, ignored in history):
+    if all(is_ignored for _, is_ignored in history):
         return 0
-    for (previous_track, _), (track, ignored) in itertools.pairwise(history):
-        if ignored:
+    for (previous_track, _), (track, is_ignored) in itertools.pairwise(history):
+        if is_ignored:
             last_track = -1
             continue
         count += last_track != track and last_track != -1 and track != -1 and previous_track != -1
