@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -62,11 +63,7 @@ class Summary:
     frames: int = 0
     boxes: int = 0
     drives: int = 0
-    remarks: dict[str, int] = field(default_factory=dict)
-
-    def add_remark(self, text: str) -> None:
-        """Increment the count of a remark."""
-        self.remarks[text] = self.remarks.get(text, 0) + 1
+    remarks: Counter[str] = field(default_factory=Counter)
 
 
 def write_dataset(
@@ -132,7 +129,7 @@ def _ensure_camera(frame: Frame, summary: Summary) -> tuple[Frame, Calibration]:
     """Return the frame and its calibration; if it has none, both use ASSUMED_CAMERA."""
     calibration = frame.calibration()
     if calibration is None:
-        summary.add_remark("assumed: a forward camera at the LiDAR, because KITTI's labels need a camera")
+        summary.remarks["assumed: a forward camera at the LiDAR, because KITTI's labels need a camera"] += 1
         calibration = ASSUMED_CAMERA
     return replace(frame, calibration=lambda: calibration), calibration
 
@@ -140,7 +137,7 @@ def _ensure_camera(frame: Frame, summary: Summary) -> tuple[Frame, Calibration]:
 def _load_cloud(frame: Frame, summary: Summary) -> np.ndarray:
     scan = frame.load()
     if scan.intensity is None:
-        summary.add_remark("assumed: an intensity of 0, because the clouds have none")
+        summary.remarks["assumed: an intensity of 0, because the clouds have none"] += 1
     return scan.points()
 
 
@@ -154,7 +151,7 @@ def _add_loss_remarks(summary: Summary, item: DatasetFrame, stored_content: str)
         ("track ids", bool((labels.track_ids != NO_TRACK).any())),
     ):
         if exists and content not in stored_content:
-            summary.add_remark(f"left out: {content}, which the layout cannot store")
+            summary.remarks[f"left out: {content}, which the layout cannot store"] += 1
 
 
 def _write_kitti_object(folder: Path, frames: Iterator[DatasetFrame], summary: Summary) -> Iterator[DatasetFrame]:
@@ -179,7 +176,7 @@ def _write_kitti_tracking(folder: Path, frames: Iterator[DatasetFrame], summary:
         texts.setdefault(name, []).append(kitti_tracking.format_frame(item.labels, frame, item.index))
         _add_loss_remarks(summary, item, "boxes, track ids")
         if (item.labels.track_ids == NO_TRACK).any():
-            summary.add_remark("boxes without a track id: written with the id -1")
+            summary.remarks["boxes without a track id: written with the id -1"] += 1
         yield item
     for name, parts in texts.items():
         write_bytes(root / f"label_02/{name}.txt", "".join(parts).encode())
@@ -218,7 +215,7 @@ def _write_semantickitti(folder: Path, frames: Iterator[DatasetFrame], summary: 
                 "".join(semantickitti.format_pose(to_first @ pose, calibration) for pose in poses).encode(),
             )
         elif poses:
-            summary.add_remark("left out: poses, because some frames of the drive have none")
+            summary.remarks["left out: poses, because some frames of the drive have none"] += 1
 
 
 def _write_nuscenes(folder: Path, frames: Iterator[DatasetFrame], summary: Summary) -> Iterator[DatasetFrame]:
@@ -226,9 +223,9 @@ def _write_nuscenes(folder: Path, frames: Iterator[DatasetFrame], summary: Summa
     for item in frames:
         frame, labels = item.frame, item.labels
         if frame.pose() is None:
-            summary.add_remark("assumed: a vehicle that does not move, because the recording has no poses")
+            summary.remarks["assumed: a vehicle that does not move, because the recording has no poses"] += 1
         for name in sorted(set(labels.class_names) & SIMILAR_NAME_BY_CLASS.keys()):
-            summary.add_remark(f"written as another class: {name} as {SIMILAR_NAME_BY_CLASS[name]}")
+            summary.remarks[f"written as another class: {name} as {SIMILAR_NAME_BY_CLASS[name]}"] += 1
         tables.add(frame, labels, item.drive, _load_cloud(frame, summary))
         _add_loss_remarks(summary, item, "boxes, poses, track ids")
         yield item

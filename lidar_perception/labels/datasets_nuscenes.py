@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import struct
 from pathlib import Path
 from typing import Any
-from zlib import compress, crc32
 
 import numpy as np
 
@@ -57,6 +55,10 @@ TABLES = (
     "map",
 )
 MAP = "maps/none.png"  # path of an empty map, which nuscenes-devkit requires
+EMPTY_MAP = bytes.fromhex(  # PNG image with one black pixel
+    "89504e470d0a1a0a0000000d49484452000000010000000108000000003a7e9b5500"
+    "00000a49444154789c636000000002000148afa4710000000049454e44ae426082"
+)
 
 
 def make_token(*parts: object) -> str:
@@ -92,7 +94,6 @@ class NuscenesTables:
 
         Args:
             frame: Frame of the recording.
-            labels: Labels of the frame.
             drive: Number of the drive.
             cloud: (N, 4) [x y z intensity].
 
@@ -229,29 +230,11 @@ class NuscenesTables:
         self.last_rows[f"{table}/{chain}"] = self.rows[table][-1]
 
     def write(self) -> None:
-        """Write the tables.
-
-        Raises:
-            InputError: A file cannot be written.
-        """
-        write_bytes(self.folder / MAP, _make_png())
+        """Write the tables. Raise InputError if a file cannot be written."""
+        write_bytes(self.folder / MAP, EMPTY_MAP)
         for name, rows in self.rows.items():
             write_text(self.folder / VERSION / f"{name}.json", json.dumps(rows, indent=0))
 
 
 def _to_quaternion(rotation: np.ndarray) -> list[float]:
     return to_quaternions(rotation[None])[0].tolist()
-
-
-def _make_png() -> bytes:
-    """Return a PNG image with one black pixel."""
-
-    def make_chunk(chunk_type: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + chunk_type + data + struct.pack(">I", crc32(chunk_type + data))
-
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + make_chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0))
-        + make_chunk(b"IDAT", compress(b"\0\0"))
-        + make_chunk(b"IEND", b"")
-    )

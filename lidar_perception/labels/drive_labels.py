@@ -15,7 +15,7 @@ from lidar_perception.types import CLASSES, MAX_RANGE, GroundTruth, InputError, 
 
 NO_TRACK = -1
 OTHER_CLASS = "Misc"  # one of CLASSES, used for unknown classes
-MAX_DIFFERENCE = 1e-4  # difference in metres and radians from the box in the file below which a box is unchanged
+MAX_DIFFERENCE = 1e-4  # maximum difference from the box in the file, in metres and radians, of an unchanged box
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +55,10 @@ class FrameLabels:
         notes: Iterable[tuple[str, dict[str, Any]]] = (),
         source: object = None,
     ) -> FrameLabels:
-        """Make labels and convert dtypes and shapes.
+        """Make labels from lists or arrays.
 
         Args:
-            source: Start of error messages, such as the name of the file.
+            source: Name of the file or frame, with which error messages start.
 
         Raises:
             InputError: A box is not finite, is beyond MAX_RANGE or has a side that is not positive;

@@ -92,10 +92,8 @@ def export_labels(
         raise InputError(
             f"the labels have {len(labels)} frames, but the drive has {len(frames)}; give the labels of this drive"
         )
-    report_format_errors(
-        "a preserved field of the file that the labels were read from",
-        lambda: FORMATS[format][1](labels, out, frames[:], force),
-    )
+    with report_format_errors("a preserved field of the file that the labels were read from"):
+        FORMATS[format][1](labels, out, frames[:], force)
     notes = 0 if format in FORMATS_WITH_NOTES else sum(len(frame_labels.notes) for frame_labels in labels.frames)
     has_ids = format == "kitti" and any((f.track_ids != NO_TRACK).any() for f in labels.frames)
     return ExportResult(
@@ -107,11 +105,7 @@ def export_labels(
 
 
 def recognise_format(path: Path) -> str:
-    """Recognise the format of the labels at a path.
-
-    Raises:
-        InputError: The format is not recognised.
-    """
+    """Recognise the format of the labels at a path. Raise InputError if it is unknown."""
     files = (
         [path]
         if path.is_file()

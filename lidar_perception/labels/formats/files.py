@@ -1,11 +1,12 @@
-"""Helpers for label files: their assignment to frames and drives, track names, and JSON."""
+"""Functions that several label formats share: files of frames and drives, track names, and JSON."""
 
 from __future__ import annotations
 
 import itertools
 import json
 import math
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -63,8 +64,8 @@ def write_drives(
     """Write one file per drive with write(file, drive, positions of its frames).
 
     Args:
-        out: File of the only drive if it has the suffix, otherwise a folder, which appears when it
-            is complete.
+        out: File of the only drive if it has the suffix; otherwise a folder, which is created after
+            all files have been written.
         frames: Frames of all drives.
         suffix: Suffix of a label file.
         force: Replace existing files.
@@ -94,7 +95,6 @@ def check_label_files(folder: Path, expected: Sequence[Path], suffix: str, ignor
     """Check that a folder has label files, and no label files of other frames.
 
     Args:
-        folder: The folder.
         expected: Label files of the frames.
         suffix: Suffix of a label file.
         ignored: Names of other files that are allowed.
@@ -171,11 +171,7 @@ def is_track_number(name: str) -> bool:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        InputError: The file cannot be read or is not valid JSON.
-    """
+    """Read a JSON file. Raise InputError if it cannot be read or is not valid JSON."""
     text = read_text(path, MAX_BYTES)
     try:
         return json.loads(text)
@@ -203,13 +199,14 @@ def replace_non_finite(value: Any) -> Any:
     return value
 
 
-def report_format_errors(source: str, read: Callable[[], Any]) -> Any:
-    """Call read(), and convert its errors to InputErrors that start with `source`.
+@contextmanager
+def report_format_errors(source: object) -> Iterator[None]:
+    """Convert errors in the block to InputErrors that start with `source`, the name of a file.
 
-    Use it for parsers of files whose values may be of any type.
+    Use it to parse files whose values may be of any type.
     """
     try:
-        return read()
+        yield
     except InputError:
         raise
     except KeyError as error:

@@ -35,11 +35,7 @@ TRUNCATION_LEVELS = (-1, 0, 1, 2)  # levels of truncation in the tracking layout
 
 
 def require_calibration(frame: Frame) -> Calibration:
-    """Return the calibration of a frame.
-
-    Raises:
-        InputError: The frame has no calibration.
-    """
+    """Return the calibration of a frame. Raise InputError if it has none."""
     calibration = frame.calibration()
     if calibration is None:
         raise InputError(
@@ -84,8 +80,6 @@ def make_lines(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str
     is missing, the level of occlusion by other boxes are computed.
 
     Args:
-        labels: Labels of the frame.
-        frame: The frame.
         levels: True to write truncation as a level, as in the tracking layout; False to write it as
             a fraction.
 

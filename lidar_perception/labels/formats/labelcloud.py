@@ -61,8 +61,8 @@ def _read(notation: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
     labels, headers = [], {}
     for frame, file in zip(frames, files):
         content = read_json(file) if file.exists() else {"objects": []}
-        rows = report_format_errors(str(file), partial(_parse_objects, content, notation))
-        labels.append(make_frame_labels(frame, rows, source=file))
+        with report_format_errors(file):
+            labels.append(make_frame_labels(frame, _parse_objects(content, notation), source=file))
         if file.exists():
             headers[frame.name] = {k: v for k, v in content.items() if k != "objects"}
     return DriveLabels(labels, {ROOT: headers})

@@ -77,21 +77,20 @@ def _require_pose(frame: Frame) -> np.ndarray:
 def _read(task: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
     """Read a result file; the boxes of other drives in it are ignored."""
     content = read_json(path)
-    results = report_format_errors(str(path), lambda: dict(content["results"]))
+    with report_format_errors(path):
+        results = dict(content["results"])
     if not results.keys() & {_get_token(frame) for frame in frames}:
         raise InputError(
             f"{path} has no samples of this drive, such as {_get_token(frames[0])}; give the results of this drive"
         )
-    ids = report_format_errors(
-        str(path),
-        lambda: assign_track_ids({str(row.get("tracking_id", "")) for rows in results.values() for row in rows} - {""}),
-    )
+    with report_format_errors(path):
+        ids = assign_track_ids({str(row.get("tracking_id", "")) for rows in results.values() for row in rows} - {""})
     labels = []
     for frame in frames:
         source = f"{path}, sample {_get_token(frame)}"
-        boxes = results.get(_get_token(frame), [])
-        rows = report_format_errors(source, partial(_parse_boxes, task, frame, boxes, ids))
-        labels.append(make_frame_labels(frame, rows, source=source))
+        with report_format_errors(source):
+            rows = _parse_boxes(task, frame, results.get(_get_token(frame), []), ids)
+            labels.append(make_frame_labels(frame, rows, source=source))
     return DriveLabels(labels, {ROOT: {key: v for key, v in content.items() if key != "results"}})
 
 
@@ -207,8 +206,6 @@ def _compute_velocities(
     """Compute velocities in the global frame from the previous and next box of each track.
 
     Args:
-        labels: Labels of the frames.
-        frames: The frames.
         poses: Pose of each frame with boxes.
 
     Returns:

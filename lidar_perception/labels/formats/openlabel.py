@@ -12,7 +12,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -64,21 +63,19 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
         if drive not in files:
             labels += [make_frame_labels(frame, ()) for frame in drive_frames]
             continue
-        source = str(files[drive])
-        drive_labels, extra[drive] = report_format_errors(
-            source, partial(_read_drive, files[drive], drive_frames, source)
-        )
+        with report_format_errors(files[drive]):
+            drive_labels, extra[drive] = _read_drive(files[drive], drive_frames)
         labels += drive_labels
     return DriveLabels(labels, {ROOT: extra})
 
 
-def _read_drive(path: Path, frames: list[Frame], source: str) -> tuple[list[FrameLabels], dict[str, Any]]:
+def _read_drive(path: Path, frames: list[Frame]) -> tuple[list[FrameLabels], dict[str, Any]]:
     """Read the file of a drive.
 
     Returns:
         The labels of each frame, and the other content of the file.
     """
-    content = dict(read_json(path)[ROOT])
+    content, source = dict(read_json(path)[ROOT]), str(path)
     objects, systems = content.get("objects", {}), content.get("coordinate_systems", {})
     frame_contents = content.get("frames", {})
     if unknown_numbers := sorted(set(frame_contents) - {str(frame.index) for frame in frames}):

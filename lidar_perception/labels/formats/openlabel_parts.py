@@ -130,11 +130,7 @@ def find_transform_to_lidar(
 
 
 def find_lidar_system(systems: dict[str, Any], source: str) -> str:
-    """Return the name of the LiDAR's coordinate system.
-
-    Raises:
-        InputError: Several coordinate systems may belong to the LiDAR.
-    """
+    """Return the name of the LiDAR's coordinate system. Raise InputError if there are several candidates."""
     sensors = [name for name, s in systems.items() if s.get("type") == "sensor_cs" and not _is_camera(name)]
     lidars = [name for name in sensors if any(word in name.lower() for word in ("lidar", "velo", "laser"))] or sensors
     if len(lidars) > 1:

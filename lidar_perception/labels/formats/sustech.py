@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,14 +53,12 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
         content = read_json(file) if file.exists() else []
         # Later versions of SUSTechPOINTS wrap the list in an object.
         contents.append(content.get("objs", content) if isinstance(content, dict) else content)
-    ids = report_format_errors(
-        str(path),
-        lambda: assign_track_ids({str(item.get("obj_id", "")) for content in contents for item in content} - {""}),
-    )
+    with report_format_errors(path):
+        ids = assign_track_ids({str(item.get("obj_id", "")) for content in contents for item in content} - {""})
     labels = []
     for frame, file, content in zip(frames, files, contents):
-        rows = report_format_errors(str(file), partial(_parse_boxes, content, ids))
-        labels.append(make_frame_labels(frame, rows, source=file))
+        with report_format_errors(file):
+            labels.append(make_frame_labels(frame, _parse_boxes(content, ids), source=file))
     return DriveLabels(labels)
 
 
