@@ -183,7 +183,8 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
     from lidar_perception.training.planning import Planner
     from lidar_perception.training.trainers import make_trainer
 
-    params, device = request.params, torch.device(find_device(request.device))
+    params: Any = request.params
+    device = torch.device(find_device(request.device))
     errors.print("benchmarking this machine on a few scenes of each network ...")
     models = request.models(params, 0)
     speed_by_params: dict[Any, Speed] = {}
@@ -260,11 +261,11 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
 def _add_speeds(speeds: Sequence[Speed]) -> Speed:
     """Return the combined speed of training several networks on the same scans."""
     return Speed(
-        speeds[0].scan,
         max(s.cut for s in speeds),
         sum(s.step for s in speeds),
         sum(s.whole for s in speeds),
         sum(s.frame for s in speeds),
+        speeds[0].scan,
         speeds[0].scan_mb,
     )
 

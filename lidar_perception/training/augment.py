@@ -169,8 +169,6 @@ def vary_background(
     Args:
         points: (N, 4) points of the object, N >= 1.
         foot: (3,) point on the ground that does not move.
-        params: Limits of the changes.
-        rng: Random generator.
 
     Returns:
         (N, 4) changed points, and the factors (3,) of the sizes, equal along x and y.
@@ -201,7 +199,6 @@ def blur_ranges(points: np.ndarray, beam: float, point: float, rng: np.random.Ge
         points: (N, 4).
         beam: Standard deviation of the error of a beam (the points of one elevation), m.
         point: Standard deviation of the error of a point, m.
-        rng: Random generator.
     """
     ranges = np.maximum(np.linalg.norm(points[:, :3], axis=1), MIN_RANGE_M)
     beams = np.floor(elevation_angles(points) / BEAM_STEP).astype(np.int64)
@@ -236,7 +233,6 @@ def move_objects(scene: TrainingScene, max_angle: float, shift: float, rng: np.r
         scene: Scene, which is not changed.
         max_angle: Maximum rotation about the object's centre, rad.
         shift: Standard deviation of the shift along x and along y, m.
-        rng: Random generator.
     """
     points, boxes = scene.points.copy(), scene.boxes.copy()
     if not (max_angle or shift):

@@ -92,37 +92,42 @@ def folder_size(folder: Path) -> int:
         return 0
 
 
-def find_missing(source: Any, numbers: Sequence[int]) -> list[int]:
-    """Return the scene numbers without a cache file; none if the source has no cache."""
-    return [i for i in numbers if (path := source.cache_file(i)) is not None and not path.is_file()]
-
-
-def fill_cache(sources: Sequence[Any], numbers: Sequence[Sequence[int]], jobs: int, title: str) -> None:
+def fill_cache(
+    sources: Sequence[Any], numbers: Sequence[Sequence[int]], jobs: int, title: str, max_gb: float = np.inf
+) -> None:
     """Write the missing cache files of several sources in several processes.
 
     Scenes that cannot be read are skipped; training reports them later.
 
     Args:
-        sources: Sources with cache_file(i) and store(i).
+        sources: Sources with cache_file(i) and load_scene(i), which writes the file.
         numbers: Scene numbers of each source.
         jobs: Number of processes.
         title: Title of the progress bar.
+        max_gb: No more files are written when the folder is larger than this.
 
     Raises:
         CacheError: A file cannot be written.
     """
-    items = [(k, i) for k, source in enumerate(sources) for i in find_missing(source, numbers[k])]
+    items = [
+        (source, i, path)
+        for source, scene_numbers in zip(sources, numbers)
+        for i in scene_numbers
+        if (path := source.cache_file(i)) is not None and not path.is_file()
+    ]
     if not items:
         return
-    results = run_in_processes(partial(_make_store_function, tuple(sources)), items, jobs, title)
+    results = run_in_processes(partial(_make_store_function, max_gb), items, jobs, title)
     for _ in show_progress(results, title, len(items)):
         pass
 
 
-def _make_store_function(sources: tuple[Any, ...]) -> Callable[[tuple[int, int]], None]:
-    def store(item: tuple[int, int]) -> None:
+def _make_store_function(max_gb: float) -> Callable[[tuple[Any, int, Path]], None]:
+    def store(item: tuple[Any, int, Path]) -> None:
+        source, i, path = item
         try:
-            sources[item[0]].store(item[1])
+            if max_gb == np.inf or folder_size(path.parent) < max_gb * 1e9:
+                source.load_scene(i)
         except CacheError:
             raise
         except InputError:

@@ -29,7 +29,7 @@ def fit_curves(
     A penalty on the steps keeps curves constant where there are no samples.
 
     Args:
-        features: Values (K,) by name. NaN values get a step of their own.
+        features: Values (K,) by name. NaN values have a separate step.
         hits: (K,) bool, the outcomes.
         weights: (K,) weights of the samples.
         knots: Knots of each feature's curve.

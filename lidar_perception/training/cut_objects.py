@@ -56,10 +56,6 @@ class CutObjects:
         """Return the cache file of scene i."""
         return make_cache_path(self.cache, self.scenes.cache_key(i), self.classes, self.min_points)
 
-    def store(self, i: int) -> None:
-        """Write the objects of scene i to the cache."""
-        self.load_scene(i)
-
     def load_scene(self, i: int) -> Database:
         """Return the objects of scene i. Raise InputError if the scene cannot be read."""
         return load_or_compute(
@@ -77,7 +73,6 @@ def cut_objects(scene: TrainingScene, classes: tuple[str, ...], min_points: int,
     find_background_objects.
 
     Args:
-        scene: Scene.
         classes: Names of the classes.
         min_points: Objects with fewer points are ignored.
         seed: Seed of the choice of background objects.
@@ -128,7 +123,6 @@ def find_background_objects(
     """Find clusters that resemble a standing person and touch no labelled box.
 
     Args:
-        scene: Scene.
         min_points: Minimum number of points of a cluster.
         rng: Random generator that selects MAX_BACKGROUND_OBJECTS if there are more.
 

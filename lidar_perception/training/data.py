@@ -29,7 +29,7 @@ class Item(NamedTuple):
 
 @dataclass(frozen=True)
 class Stream:
-    """Endless sequence of samples, in which each epoch has every scene of all sources in a new order.
+    """Endless sequence of samples. Each epoch contains every scene of all sources once, in a new order.
 
     A scene that cannot be read or prepared (InputError) is skipped and replaced by the next one.
     stream[n] raises InputError if no scene can be used.
@@ -117,14 +117,10 @@ class Batches:
         """Steps per epoch, at least 1."""
         return max(1, round(len(self.stream) / (self.size * self.world_size)))
 
-    def _iterate_indices(self, step: int) -> Iterator[list[int]]:
-        """Yield the stream indices of the batches of this step and all later ones."""
-        for i in count(step):
-            first = (i * self.world_size + self.rank) * self.size
-            yield list(range(first, first + self.size))
-
     def __call__(self, step: int) -> Iterator[list[Any]]:
-        for items in load_items(self.stream, self._iterate_indices(step), self.jobs):
+        starts = count((step * self.world_size + self.rank) * self.size, self.world_size * self.size)
+        groups = (list(range(start, start + self.size)) for start in starts)
+        for items in load_items(self.stream, groups, self.jobs):
             for reason in (reason for item in items for reason in item.skipped):
                 if reason not in self.skipped:
                     errors.print(f"skipped: {reason}")

@@ -84,7 +84,6 @@ def paste_objects(
         database: Objects and background objects. Background objects get no box.
         params: Number of objects by class, and the augmentation of background.
         low, high: (2 or more,) limits of the centres of pasted objects, m.
-        rng: Random generator.
     """
     points, boxes = scene.points, scene.boxes
     class_ids = []
@@ -96,18 +95,18 @@ def paste_objects(
         (BACKGROUND_ID, params.things),
     ):
         candidates = np.flatnonzero(database.class_ids == class_id)
-        missing = number - int((scene.class_ids == class_id).sum())
-        for i in rng.permutation(candidates)[: max(MAX_TRIES * missing, 0)]:
-            if missing == 0:
+        missing_count = number - int((scene.class_ids == class_id).sum())
+        for i in rng.permutation(candidates)[: max(MAX_TRIES * missing_count, 0)]:
+            if missing_count == 0:
                 break
             box, object_points = database.boxes[i], database.get_points(i)
             if class_id == BACKGROUND_ID:
                 box, object_points = vary_background_box(box, object_points, params, rng)
-            pasted = _paste(box, object_points, points, boxes, free_depths, low, high, rng)
-            if pasted is not None:
-                points, boxes = pasted
+            result = _paste(box, object_points, points, boxes, free_depths, low, high, rng)
+            if result is not None:
+                points, boxes = result
                 class_ids.append(class_id)
-                missing -= 1
+                missing_count -= 1
     pasted_ids = np.array(class_ids, scene.class_ids.dtype)
     is_object = pasted_ids != BACKGROUND_ID
     return replace(
@@ -167,9 +166,9 @@ def _to_sectors(angles: np.ndarray) -> np.ndarray:
 def _draw_rotation(
     box: np.ndarray, free_depths: np.ndarray, low: np.ndarray, high: np.ndarray, rng: np.random.Generator
 ) -> float | None:
-    """Draw a rotation about the sensor (rad) that moves a box (7,) between the limits and to where it is not hidden.
+    """Draw a rotation about the sensor (rad) after which a box (7,) is within the limits and not hidden.
 
-    Returns None if no drawn rotation does.
+    Returns None if no such rotation is drawn.
     """
     distance, radius = np.hypot(box[0], box[1]), np.hypot(box[3], box[4]) / 2
     rotations = rng.uniform(-np.pi, np.pi, MAX_DIRECTIONS)

@@ -47,11 +47,7 @@ def get_world_size() -> int:
 
 def is_true_anywhere(flag: bool, device: torch.device) -> bool:
     """Return True if flag is True in any process. All processes must call this."""
-    if get_world_size() == 1:
-        return flag
-    value = torch.tensor(int(flag), device=device)
-    distributed.all_reduce(value, distributed.ReduceOp.MAX)
-    return bool(value.item())
+    return find_minimum(-float(flag), device) < 0
 
 
 def find_minimum(number: float, device: torch.device) -> float:

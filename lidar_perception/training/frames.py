@@ -145,17 +145,17 @@ def draw_drives(drives: Sequence[Sequence[T]], fraction: float, seed: int) -> li
     Raises:
         InputError: There are fewer than two items.
     """
-    missing = _count_held_out(sum(map(len, drives)), fraction)
+    missing_count = _count_held_out(sum(map(len, drives)), fraction)
     order = np.random.default_rng(seed).permutation(len(drives))
     items: list[T] = []
     longer_drives: list[Sequence[T]] = []
     for drive in (drives[i] for i in order):
-        if len(drive) <= missing:
+        if len(drive) <= missing_count:
             items.extend(drive)
-            missing -= len(drive)
+            missing_count -= len(drive)
         else:
             longer_drives.append(drive)
-    return [*items, *(longer_drives[0][-missing:] if missing else ())]
+    return [*items, *(longer_drives[0][-missing_count:] if missing_count else ())]
 
 
 def _count_held_out(count: int, fraction: float) -> int:

@@ -79,7 +79,7 @@ class Samples:
 
 
 class CurveScore(NamedTuple):
-    """Mean log loss of curves, and number of correct and wrong proposals above the default threshold."""
+    """Mean log loss of curves, and numbers of correct and wrong proposals above the default threshold."""
 
     loss: float
     correct: int
@@ -91,8 +91,9 @@ class ClassFit(NamedTuple):
 
     Attributes:
         proposals, correct: Number of proposals, and of correct ones.
-        old_score: Score of the previous curves.
-        new_score: Score of the new curves by cross-validation; None with too few proposals.
+        old_score: Loss and counts with the shipped curves.
+        new_score: Loss and counts with the new curves, by cross-validation; None with too few
+            proposals.
     """
 
     proposals: int
@@ -139,8 +140,11 @@ def fit_fusion(
         if warning := network_header.find_height_mismatch(sensor.height):
             errors.print(f"{NETWORKS[network_header.network][0]}: {warning}")
     source = SimulatedScenes(FIRST_FIT_SEED, params.scans, sensor, scenes, all_around=all_around)
-    samples, shipped = simulate_samples(FusedDetectorParams(fused=fused), source, jobs), find_fusion()
-    old_models = {WITH_INTENSITY: shipped.models, WITHOUT_INTENSITY: shipped.models_without_intensity or shipped.models}
+    samples, old_fusion = simulate_samples(FusedDetectorParams(fused=fused), source, jobs), find_fusion()
+    old_models = {
+        WITH_INTENSITY: old_fusion.models,
+        WITHOUT_INTENSITY: old_fusion.models_without_intensity or old_fusion.models,
+    }
     models, fits = {}, {}
     for kind in CLOUD_KINDS:
         models[kind], fits[kind] = fit_classes(samples[kind], old_models[kind])
@@ -167,11 +171,7 @@ def fit_fusion(
 
 
 def fill_from_header(params: FusedTraining, header: Header) -> FusedTraining:
-    """Fill in an empty sensor or scene with those that the weights were trained on.
-
-    Raises:
-        InputError: The file of that sensor is missing.
-    """
+    """Fill in an empty sensor or scene from the header. Raise InputError if the file of the sensor is missing."""
     sensor, training_params = _read_sensor(header), header.training.get("params")
     name = sensor.get("name") or DEFAULT_SENSOR
     if not params.sensor and Path(name).suffix in (".yaml", ".yml") and not Path(name).is_file():
@@ -209,7 +209,7 @@ def collect_samples(frame: Frame, proposals: Proposals, scan: int) -> Samples:
     assert truth is not None  # simulated frames always have labels
     centres = detections.boxes[:, :3] - np.array([0, 0, frame.sensor_height - SENSOR_HEIGHT], np.float32)
     in_view = np.ones(len(detections), bool) if camera is None else camera.in_view(centres)
-    indices, correct = [], []
+    indices, is_correct = [], []
     for class_id in np.unique(detections.class_ids):
         order = np.flatnonzero((detections.class_ids == class_id) & in_view)
         order = order[np.argsort(-detections.scores[order], kind="stable")]
@@ -218,16 +218,16 @@ def collect_samples(frame: Frame, proposals: Proposals, scan: int) -> Samples:
         similar = truth.select_class(CLASSES.index(NEIGHBOURS.get(name, name)))
         is_matched = np.zeros(hits.shape[1], bool)
         for i, hit, similar_hit in zip(order, hits, _match_boxes(boxes, similar, name)):
-            unmatched = np.flatnonzero(hit & ~is_matched)
-            if not len(unmatched) and (hit.any() or similar_hit.any()):
+            new_matches = np.flatnonzero(hit & ~is_matched)
+            if not len(new_matches) and (hit.any() or similar_hit.any()):
                 continue
-            is_matched[unmatched[:1]] = True
+            is_matched[new_matches[:1]] = True
             indices.append(i)
-            correct.append(len(unmatched) > 0)
+            is_correct.append(len(new_matches) > 0)
     rows = np.array(indices, np.int64)
     return Samples(
         detections.class_ids[rows],
-        np.array(correct, bool),
+        np.array(is_correct, bool),
         np.full(len(rows), scan),
         {name: odds[rows] for name, odds in proposals.evidence.items()},
     )
@@ -295,7 +295,7 @@ def fit_classes(samples: Samples, old_models: Models) -> tuple[Models, dict[str,
 def has_enough_samples(samples: Samples) -> bool:
     """Return True if both halves of the scans have enough correct and wrong proposals."""
     halves = [samples.correct[samples.scans % 2 == half] for half in range(2)]
-    return all(min(correct.sum(), (~correct).sum()) >= MIN_SAMPLES / 2 for correct in halves)
+    return all(min(is_correct.sum(), (~is_correct).sum()) >= MIN_SAMPLES / 2 for is_correct in halves)
 
 
 def fit_class(name: str, samples: Samples) -> dict:

@@ -13,7 +13,7 @@ from lidar_perception.types import InputError
 
 
 class Table:
-    """CSV file with a column "step" and other columns, which the first added row determines."""
+    """CSV file with a column "step". The first row that is added determines the other columns."""
 
     def __init__(self, path: Path, step: int):
         """Open a table. Drop the rows after `step`, which a killed run wrote after its last save."""

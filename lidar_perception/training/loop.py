@@ -66,8 +66,8 @@ def train(
             not writable; or the loss is not finite for too many steps.
     """
     directory = RunDirectory(out)
-    directory.require_no_state(resume)
     path = directory.state_file
+    directory.require_absent(path, resume)
     make_folder(out)
     torch.manual_seed(params.seed + get_rank())
     run = Run(task, params, device)

@@ -8,7 +8,7 @@ from typing import Any
 from lidar_perception.detectors.params import make_range_param
 from lidar_perception.param_fields import Params, flatten, param
 
-CHANGEABLE = ("log_steps", "save_steps", "max_skipped", "data.cache", "data.cache_gb")  # may change on resuming
+CHANGEABLE = ("log_steps", "save_steps", "max_skipped", "data.cache", "data.cache_gb")  # may differ in a resumed run
 PAPER_VAL_FRACTION = 751 / 7518  # fraction of the frames that paper B holds out
 
 
@@ -19,9 +19,9 @@ class LoopParams(Params):
     steps: int = param(0, "Training steps. 0: determined by the epochs or the budget.", low=0, high=10**9)
     epochs: float = param(0.0, "Passes over the data, if steps is 0. 0: determined by the budget.", low=0.0, high=1e5)
     batch: int = param(4, "Scenes per step on each device.", low=1, high=4096)
-    lr: float = param(0.003, "Highest learning rate.", low=1e-9, high=10.0)
+    lr: float = param(0.003, "Maximum learning rate.", low=1e-9, high=10.0)
     warm_share: float = param(
-        0.4, "Fraction of the steps with a rising learning rate; afterwards it falls.", low=0.01, high=0.99
+        0.4, "Fraction of the steps in which the learning rate rises; after them it falls.", low=0.01, high=0.99
     )
     weight_decay: float = param(0.01, "Weight decay of AdamW.", low=0.0, high=1.0)
     clip: float = param(10.0, "Maximum norm of the gradient; larger ones are clipped. 0: no limit.", low=0.0, high=1e6)
@@ -91,7 +91,12 @@ class IntensityParams(Params):
         low=0.0,
         high=2.0,
     )
-    quantize: int = param(16, "Intensities are rounded to between this many and 255 levels. 0: off.", low=0, high=255)
+    quantize: int = param(
+        16,
+        "Minimum number of levels to which intensities are rounded; the number is drawn from this to 255. 0: off.",
+        low=0,
+        high=255,
+    )
     speckle: float = param(0.05, "Maximum standard deviation of the error of each intensity.", low=0.0, high=1.0)
 
 
@@ -145,7 +150,10 @@ class AugmentParams(BackgroundParams, IntensityParams):
     scale: float = param(0.05, "Maximum relative change of the scale of the scene.", low=0.0, high=0.5)
     dropout: float = param(0.3, "Maximum fraction of dropped points.", low=0.0, high=0.99)
     intensity: float = param(
-        0.15, "Maximum relative change of the intensity, and twice the maximum offset; 0 stays 0.", low=0.0, high=1.0
+        0.15,
+        "Maximum relative change of the intensity; the maximum offset is half of it. An intensity of 0 stays 0.",
+        low=0.0,
+        high=1.0,
     )
     height: float = param(0.1, "Maximum change of the height of the sensor.", unit="m", low=0.0, high=2.0)
     tilt: float = param(0.01, "Maximum tilt of the ground, forwards and sideways.", unit="m/m", low=0.0, high=0.3)
@@ -179,8 +187,8 @@ class DataParams(Params):
     val_share: float = param(
         PAPER_VAL_FRACTION,
         "Fraction of the frames held out for validation if "
-        "neither --val nor --val-split is given. The seed selects them; "
-        "of recorded drives, complete drives are held out, or the end of one.",
+        "neither --val nor --val-split is given. The seed selects them. From "
+        "recorded drives, whole drives are held out, and the last part of one.",
         low=0.0,
         high=0.9,
     )
@@ -294,8 +302,8 @@ class PointNetTraining(SceneTraining):
         "improved",
         "improved: the paper's network. pointnet, pointnet2: plain "
         "PointNet and PointNet++ (single-scale grouping), for comparison. The "
-        "others are rows of the paper's ablation, other choices of centroids "
-        "and weights, and other radii.",
+        "others are for ablations: rows of the paper's table, other methods to "
+        "select centroids and to weight points, and other radii.",
         choices=(
             "improved",
             "pointnet",

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 from lidar_perception.types import InputError
 
-RESERVE_FRACTION = 0.1  # part of the budget reserved for everything that is not measured
+RESERVE_FRACTION = 0.1  # fraction of the budget kept in reserve for work that is not measured
 STARTUP_S = 20.0  # time until all processes run
-MAX_PREPARATION_FRACTION = 0.25  # maximum part of the time for the preparation of scenes
-VALIDATION_FRACTION = 0.12  # part of the time for validations
+MAX_PREPARATION_FRACTION = 0.25  # maximum fraction of the time for the preparation of scenes
+VALIDATION_FRACTION = 0.12  # fraction of the time for validations
 SCANS_RANGE, VAL_SCANS_RANGE = (24, 3000), (16, 200)
 MAX_VALIDATIONS = 6
 EPOCHS_RANGE = 4, 80
@@ -22,19 +22,19 @@ class Speed:
     """Measured durations in seconds, and the size of a scan.
 
     Attributes:
-        scan: Duration of simulating a scan on one core; 0 if nothing is simulated.
         cut: Duration of cutting the objects or clusters from a scan on one core.
         step: Duration of a training step on the reduced range.
         whole: Duration of a training step on the full range.
         frame: Duration of validating a frame.
+        scan: Duration of simulating a scan on one core; 0 if nothing is simulated.
         scan_mb: Size of a cached scan, MB.
     """
 
-    scan: float
     cut: float
     step: float
     whole: float
     frame: float
+    scan: float = 0.0
     scan_mb: float = 0.0
 
 

@@ -114,13 +114,13 @@ class Planner:
 
     def open_few_scenes(self) -> tuple[Sequence[Any], Sequence[Any]]:
         """Open the training and validation sources with only a few simulated scans and no cache."""
-        return open_scenes(self.request, limit_to_few_scans(self.params), self.sensor)
+        return open_sources(self.request, limit_to_few_scans(self.params), self.sensor)
 
     def measure_speed(self, sources: Sequence[Any], val_sources: Sequence[Any]) -> Speed:
         """Measure durations on this machine with the sources from open_few_scenes."""
         scenes, scan, scan_mb = _time_scans((*sources, *val_sources))
-        step_speed = self.trainer.measure_speed(limit_to_few_scans(self.params), scenes, val_sources, self.device)
-        return Speed(scan, *step_speed, scan_mb)
+        speed = self.trainer.measure_speed(limit_to_few_scans(self.params), scenes, val_sources, self.device)
+        return replace(speed, scan=scan, scan_mb=scan_mb)
 
     def _print_plan(self, plan: Plan, speed: Speed, data: AvailableScenes, height: float | None) -> None:
         params = self.params
@@ -158,23 +158,6 @@ class Planner:
             + ", ".join(f"{name} {format_duration(value)}" for name, value in durations.items())
         )
         errors.print(f"cache: {params.data.cache}; resume an interrupted run with --resume")
-
-
-def open_scenes(request: TrainingRequest, params: Any, sensor: Sensor) -> tuple[tuple, tuple]:
-    """Open the training and validation sources of a request, see sources.open_sources."""
-    all_around = getattr(params, "range", "") == "around"
-    return open_sources(
-        request.data,
-        request.val,
-        request.split,
-        request.val_split,
-        params.data,
-        params.seed,
-        sensor,
-        all_around,
-        params.scene,
-        params.mount_height,
-    )
 
 
 def limit_to_few_scans(params: Any) -> Any:

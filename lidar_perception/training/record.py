@@ -51,29 +51,29 @@ def make_save_function(
 def load_initial_weights(network: Net, init: Path | None, config_type: type[Config]) -> Net:
     """Load the tensors of a checkpoint that fit the network; print a message if some do not fit."""
     if init is not None:
-        loaded, count = copy_matching_weights(network, init, config_type)
-        if loaded < count:
-            errors.print(f"loaded {loaded} of {count} tensors from {init}; the others are initialised at random")
+        loaded_count, count = copy_matching_weights(network, init, config_type)
+        if loaded_count < count:
+            errors.print(f"loaded {loaded_count} of {count} tensors from {init}; the others are initialised at random")
     return network
 
 
-def report_skipped(skipped: Sequence[str], remaining: int, reported: set[str]) -> None:
-    """Print each reason why validation frames were skipped once.
+def report_skipped(reasons: Sequence[str], frame_count: int, reported_reasons: set[str]) -> None:
+    """Print the reasons why validation frames were skipped, each only once.
 
     Args:
-        skipped: Reasons.
-        remaining: Number of frames that were not skipped.
-        reported: Reasons that were printed before; new ones are added.
+        reasons: Reason for each skipped frame.
+        frame_count: Number of frames that were not skipped.
+        reported_reasons: Reasons that were printed before; new ones are added.
 
     Raises:
-        InputError: No frame remains.
+        InputError: All frames were skipped.
     """
-    for reason in dict.fromkeys(skipped):
-        if reason not in reported:
+    for reason in dict.fromkeys(reasons):
+        if reason not in reported_reasons:
             errors.print(f"validation: {reason}")
-    reported.update(skipped)
-    if remaining == 0:
-        raise InputError(f"no usable validation frame ({next(iter(skipped), 'there are no frames')})")
+    reported_reasons.update(reasons)
+    if frame_count == 0:
+        raise InputError(f"no usable validation frame ({next(iter(reasons), 'there are no frames')})")
 
 
 def round_metrics(metrics: dict[str, float]) -> dict[str, float | None]:

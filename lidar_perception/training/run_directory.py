@@ -57,16 +57,13 @@ class RunDirectory:
         """
         files = self.plan_file, self.state_file
         for file in files:
-            self._require_absent(file, resume)
+            self.require_absent(file, resume)
         for name in WEIGHTS:
             if not any(file.exists() for file in files) and (self.path / name).exists():
                 raise InputError(f"{self.path / name} exists and would be replaced; give another --out")
 
-    def require_no_state(self, resume: bool) -> None:
-        """Raise InputError if the folder contains a state and resume is False, or is not writable."""
-        self._require_absent(self.state_file, resume)
-
-    def _require_absent(self, file: Path, resume: bool) -> None:
+    def require_absent(self, file: Path, resume: bool) -> None:
+        """Raise InputError if the folder contains this file and resume is False, or is not writable."""
         check_writable_folder(self.path)
         if file.exists() and not resume:
             raise InputError(
@@ -99,11 +96,7 @@ class RunDirectory:
         )
 
     def read_plan(self, settings: dict[str, Any]) -> PlannedRun:
-        """Read the plan file.
-
-        Raises:
-            InputError: The file cannot be read, or was made with other settings.
-        """
+        """Read the plan file. Raise InputError if it cannot be read, or was made with other settings."""
         text = read_text(self.plan_file, MAX_RUN_BYTES)
         try:
             content = json.loads(text)

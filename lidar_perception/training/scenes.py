@@ -26,7 +26,7 @@ from lidar_perception.simulation.drive import choose_scan_index, simulate_scan
 from lidar_perception.simulation.scene import ALL_STREETS, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.training.augment import TrainingScene
-from lidar_perception.training.cache import file_fingerprint, folder_size, load_or_compute, make_cache_path
+from lidar_perception.training.cache import file_fingerprint, load_or_compute, make_cache_path
 from lidar_perception.types import GroundTruth, InputError, PointCloud
 
 EXTRAS = ("track_id", "truncated", "occluded", "num_points", "visible")  # keys of GroundTruth.extras to cache
@@ -165,11 +165,6 @@ class SimulatedScenes:
     def load_scan(self, i: int) -> tuple[PointCloud, GroundTruth]:
         """Load scan i with all its objects from the cache, or simulate it."""
         return load_or_compute(self.cache_file(i), lambda: self._simulate(i), _from_arrays, _to_arrays, self.cache_gb)
-
-    def store(self, i: int) -> None:
-        """Write scan i to the cache, unless the cache is full."""
-        if self.cache is not None and folder_size(self.cache) < self.cache_gb * 1e9:
-            self.load_scan(i)
 
     def _simulate(self, i: int) -> tuple[PointCloud, GroundTruth]:
         scan = simulate_scan(*self.locate(i), self.sensor, self.scenes)

@@ -31,13 +31,14 @@ from lidar_perception.training.planning import (
     find_recorded_height,
     has_simulated,
     limit_to_few_scans,
-    open_scenes,
 )
+from lidar_perception.training.record import load_initial_weights, make_save_function
 from lidar_perception.training.request import PACKAGE, TrainingRequest
-from lidar_perception.training.run import Progress
+from lidar_perception.training.run import Progress, Task
 from lidar_perception.training.run_directory import SCANS, RunDirectory
 from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes
-from lidar_perception.training.trainer import Cuts, Trainer
+from lidar_perception.training.sources import open_sources
+from lidar_perception.training.trainer import Trainer
 from lidar_perception.types import InputError
 
 
@@ -64,9 +65,7 @@ def start_training(
     follows the same plan. All prepared scenes are cached, so a run may be killed at any time.
 
     Args:
-        trainer: Trainer of the network.
         request: Data, output folder and limits.
-        params: Parameters of the training.
         commit: Version of the code, for the header of the checkpoints.
         speed: Durations for the plan; None measures them on this machine.
 
@@ -92,16 +91,22 @@ def start_training(
         planner = Planner(trainer, request, params, sensor, device, speed)
         if get_rank() == 0:
             make_folder(Path(params.data.cache))
-            with _explain_interrupt():
-                _make_plan(planner, directory, settings)
+            if directory.plan_file.is_file():
+                errors.print(f"resuming {directory.path}")
+            else:
+                with _explain_interrupt():
+                    directory.write_plan(planner.make_plan(settings))
         wait_for_all()
         run = directory.read_plan(settings)
         params = planner.apply_plan(run.plan)
-        sources, val_sources = open_scenes(request, params, sensor)
+        sources, val_sources = open_sources(request, params, sensor)
         cuts = trainer.make_cuts(params, sources, val_sources, Path(params.data.cache))
         if get_rank() == 0:
             with _explain_interrupt():
-                _prepare_scenes(trainer, request, sources, val_sources, cuts)
+                simulated_sources = [s for s in (*sources, *val_sources) if isinstance(s, SimulatedScenes)]
+                scan_numbers = [range(len(source)) for source in simulated_sources]
+                fill_cache(simulated_sources, scan_numbers, request.jobs, "simulating", params.data.cache_gb)
+                fill_cache(*cuts, request.jobs, trainer.cutting_title)
                 trainer.collect_cuts(params, cuts, request.out)
         wait_for_all()
         stream, validation = trainer.make_streams(params, sources, val_sources, cuts, request.out)
@@ -114,7 +119,17 @@ def start_training(
             "init": str(request.init or ""),
             "sensor": _describe_sensor(params, sensor, sources),
         }
-        task = trainer.make_task(params, batches, validation, request.out, device, data_info, commit, init)
+        torch.manual_seed(params.seed)
+        network = load_initial_weights(trainer.make_network(), init, type(trainer.config)).to(device)
+        task = Task(
+            network,
+            trainer.make_loss(params, device),
+            batches,
+            trainer.make_validate(params, validation, device, request.jobs),
+            make_save_function(request.out, trainer.config, params, batches, data_info, commit),
+            batches.steps_per_epoch,
+            data_info,
+        )
         deadline = math.inf if hours is None else start + 3600 * hours
         progress = train(
             task,
@@ -146,28 +161,12 @@ def _explain_interrupt() -> Iterator[None]:
         raise
 
 
-def _make_plan(planner: Planner, directory: RunDirectory, settings: dict[str, Any]) -> None:
-    """Write the plan if the run has none yet."""
-    if directory.plan_file.is_file():
-        errors.print(f"resuming {directory.path}")
-    else:
-        directory.write_plan(planner.make_plan(settings))
-
-
-def _prepare_scenes(
-    trainer: Trainer, request: TrainingRequest, sources: Sequence[Any], val_sources: Sequence[Any], cuts: Cuts
-) -> None:
-    simulated = [s for s in (*sources, *val_sources) if isinstance(s, SimulatedScenes)]
-    fill_cache(simulated, [range(len(s)) for s in simulated], request.jobs, "simulating")
-    fill_cache(*cuts, request.jobs, trainer.cutting_title)
-
-
 def _collect_settings(request: TrainingRequest, params: Any, sensor: Sensor, init: Path | None) -> dict[str, Any]:
     """Return the settings that must not change when the run is resumed.
 
     Splits and weights are represented by their content, because their files may change.
     """
-    sources, val_sources = open_scenes(request, limit_to_few_scans(params), sensor)
+    sources, val_sources = open_sources(request, limit_to_few_scans(params), sensor)
     weights_hash = sha256(init.read_bytes()).hexdigest()[:12] if init else ""
     return {
         **params.get_fixed_settings(),

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import torch
+from torch import nn
 
-from lidar_perception.training.data import Batches, Item, SceneReader, Stream
-from lidar_perception.training.run import Task
+from lidar_perception.training.data import Item, SceneReader, Stream
+from lidar_perception.training.plan import Speed
+from lidar_perception.training.run import Validation
 
 
 class Cuts(NamedTuple):
@@ -19,20 +21,12 @@ class Cuts(NamedTuple):
     numbers: list[Sequence[int]]
 
 
-class StepSpeed(NamedTuple):
-    """The durations of plan.Speed that depend on the network, in seconds."""
-
-    cut: float
-    step: float
-    whole: float
-    frame: float
-
-
 class Trainer(Protocol):
-    """The parts of a training run that depend on the network.
+    """The parts of a training run that depend on the network; `params` are the parameters of the training."""
 
-    The argument `params` of all methods has the parameters of the training.
-    """
+    @property
+    def config(self) -> Any:
+        """Configuration of the network."""
 
     @property
     def name(self) -> str:
@@ -50,8 +44,8 @@ class Trainer(Protocol):
 
     def measure_speed(
         self, params: Any, scenes: Iterable[Item], val_sources: Sequence[Any], device: torch.device
-    ) -> StepSpeed:
-        """Measure durations on the first usable scenes. Raise InputError if there are none."""
+    ) -> Speed:
+        """Measure the speed on the first usable scenes, without simulation. Raise InputError if there are none."""
 
     def find_packaged_weights(self, params: Any) -> Path:
         """Return the path of the packaged weights. Raise InputError if there are none."""
@@ -67,26 +61,13 @@ class Trainer(Protocol):
     ) -> tuple[Stream, SceneReader]:
         """Return the stream of training samples and the validation scenes."""
 
-    def make_task(
-        self,
-        params: Any,
-        batches: Batches,
-        val_scenes: SceneReader,
-        out: Path,
-        device: torch.device,
-        data_info: dict[str, Any],
-        commit: str,
-        init: Path | None,
-    ) -> Task:
-        """Make the task of the training loop.
+    def make_network(self) -> nn.Module:
+        """Make the network with random weights."""
 
-        Args:
-            params: Parameters of the training, with the numbers of the plan.
-            batches: Batches of training samples.
-            val_scenes: Validation scenes.
-            out: Folder for best.safetensors and last.safetensors.
-            device: Device of the network.
-            data_info: Description of the data for the header. It must be the same in a resumed run.
-            commit: Version of the code for the header.
-            init: Checkpoint with initial weights, see checkpoint.copy_matching_weights; None for random ones.
-        """
+    def make_loss(self, params: Any, device: torch.device) -> Callable:
+        """Return the loss function, see Task."""
+
+    def make_validate(
+        self, params: Any, val_scenes: SceneReader, device: torch.device, jobs: int
+    ) -> Callable[[Any], Validation]:
+        """Return the validation function, see Task. It reads scenes in `jobs` processes."""

@@ -26,7 +26,7 @@ from lidar_perception.types import InputError
 SPEED = Speed(scan=0.4, cut=0.1, step=1.2, whole=3.0, frame=0.2)
 SIM = AvailableScenes(True, True, 0, 0, 4, 500)
 speeds = st.builds(
-    lambda scan, cut, step, share, frame: Speed(scan, cut, step, step / share, frame),
+    lambda scan, cut, step, share, frame: Speed(cut, step, step / share, frame, scan),
     st.floats(0.05, 5),
     st.floats(0.01, 1),
     st.floats(0.01, 20),

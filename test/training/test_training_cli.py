@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -17,6 +19,7 @@ from lidar_perception.detectors.pointpillars.detector import load_detector
 from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.training.params import PAPER_VAL_FRACTION, DataParams, PointPillarsTraining
+from lidar_perception.training.request import TrainingRequest
 from lidar_perception.training.sources import open_sources
 from lidar_perception.types import InputError
 
@@ -124,34 +127,37 @@ def test_broken_scenes_of_a_mixture_are_counted(tmp_path, cache, tiny_size):
     assert header.metrics["Pedestrian_3d"] is not None
 
 
-def count_frames(*arguments) -> tuple[list, list]:
-    train_on, judge_on = open_sources(*arguments)
-    return [len(x) for x in train_on], [len(x) for x in judge_on]
+def open_data(data, val=(), split=None, val_split=None, **data_params) -> tuple[tuple, tuple]:
+    request = TrainingRequest(data, val, split, val_split, Path("out"), False, None, "cpu", 0)
+    return open_sources(request, PointPillarsTraining(data=DataParams(**data_params)))
 
 
 def test_held_out_frames_are_not_trained_on(tmp_path):
     root = object_folder(tmp_path, count=5)
-    params = DataParams(scans=7, val_scans=2, val_share=0.4)
+    open_frames = functools.partial(open_data, scans=7, val_scans=2, val_share=0.4)
+
+    def count_frames(*arguments) -> list[list[int]]:
+        return [[len(source) for source in sources] for sources in open_frames(*arguments)]
+
     folder = str(root)
-    (train_on, *_), (held, *_) = open_sources((folder,), (), None, None, params, 0)
+    (train_on, *_), (held, *_) = open_frames((folder,))
     assert (len(train_on), len(held)) == (3, 2) and not {*train_on.names} & {*held.names}
-    assert count_frames((folder, "sim"), (), None, None, params, 0) == ([3, 7], [2, 2])
-    assert count_frames((folder,), ("sim",), None, None, params, 0) == ([5], [2])
-    assert count_frames(("sim",), (folder,), None, None, params, 0) == ([7], [5])
-    (streets,) = open_sources(("sim",), (), None, None, params, 0)[0]
-    (others,) = open_sources(("sim",), (), None, None, params, 0)[1]
+    assert count_frames((folder, "sim")) == [[3, 7], [2, 2]]
+    assert count_frames((folder,), ("sim",)) == [[5], [2]]
+    assert count_frames(("sim",), (folder,)) == [[7], [5]]
+    (streets,), (others,) = open_frames(("sim",))
     assert streets.first_seed + streets.count <= others.first_seed
     ours, theirs = write(tmp_path / "a", "000000\n000001\n"), write(tmp_path / "b", "000001\n")
-    (train_on,), (held,) = open_sources((folder,), (folder,), ours, theirs, params, 0)
+    (train_on,), (held,) = open_frames((folder,), (folder,), ours, theirs)
     assert (train_on.names, held.names) == (("000000",), ("000001",))
-    (train_on,), (held,) = open_sources((folder,), (), None, theirs, params, 0)
+    (train_on,), (held,) = open_frames((folder,), (), None, theirs)
     assert len(train_on) == 4 and held.names == ("000001",)
     with pytest.raises(InputError, match="--split"):
-        open_sources(("sim",), (), ours, None, params, 0)
+        open_frames(("sim",), (), ours)
     with pytest.raises(InputError, match="--val-split"):
-        open_sources(("sim",), (), None, theirs, params, 0)
+        open_frames(("sim",), (), None, theirs)
     with pytest.raises(InputError, match="no frame is left"):
-        open_sources((folder,), (folder,), theirs, theirs, params, 0)
+        open_frames((folder,), (folder,), theirs, theirs)
 
 
 def test_training_and_validation_share_no_frame_by_any_path(tmp_path, monkeypatch):
@@ -166,7 +172,7 @@ def test_training_and_validation_share_no_frame_by_any_path(tmp_path, monkeypatc
         """Return the names of the frames to train on and to validate on."""
         return [
             sorted(name for source in sources for name in source.names)
-            for sources in open_sources(*arguments, DataParams(val_share=0.4), 0)
+            for sources in open_data(*arguments, val_share=0.4)
         ]
 
     for other in (str(root), "kitti", "kitti/training", "../" + tmp_path.name + "/kitti"):
@@ -224,7 +230,7 @@ def test_file_as_out_is_rejected_before_simulation(tmp_path, monkeypatch):
     def never(*_):
         raise AssertionError("data was prepared")
 
-    monkeypatch.setattr("lidar_perception.training.planning.open_sources", never)
+    monkeypatch.setattr("lidar_perception.training.start.open_sources", never)
     file = write(tmp_path / "out", b"")
     for out in (file, file / "below"):
         for kind in ("pointpillars", "pointnet"):

@@ -92,7 +92,7 @@ class CutScenes:
     def cache_file(self, i: int) -> Path | None:
         """Return the cache file of scene i."""
         proposer = [] if self.proposer is None else [file_fingerprint(self.proposer)]
-        sparse = [fraction] if (fraction := self.draw_fraction(i)) < 1 else []
+        fractions = [fraction] if (fraction := self.draw_fraction(i)) < 1 else []
         return make_cache_path(
             self.cache,
             self.scenes.cache_key(i),
@@ -101,12 +101,8 @@ class CutScenes:
             self.config.classes,
             self.min_points,
             *proposer,
-            *sparse,
+            *fractions,
         )
-
-    def store(self, i: int) -> None:
-        """Write the clusters of scene i to the cache."""
-        self.load_scene(i)
 
     def load_scene(self, i: int) -> CutScene:
         """Return the clusters of scene i. Raise InputError if the scene cannot be read."""
@@ -132,7 +128,6 @@ def cut_clusters(
     UNKNOWN.
 
     Args:
-        scene: Scene.
         config: Configuration of the network, with ground segmentation and clustering.
         min_points: Clusters with fewer points are ignored.
         proposer: PointPillars checkpoint whose wrong proposals become decoys, or None.
@@ -219,8 +214,8 @@ def _load_proposer(path: Path) -> PointPillarsDetector:
 
 def drop_touching(candidates: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     """Return the candidate boxes (D, 7) that touch no labelled box (M, 7)."""
-    enlarged = boxes + [0, 0, 0, 2 * OBJECT_MARGIN_M, 2 * OBJECT_MARGIN_M, 0, 0]
-    return candidates[~(bev_iou(candidates, enlarged) > 0).any(axis=1)]
+    enlarged_boxes = boxes + [0, 0, 0, 2 * OBJECT_MARGIN_M, 2 * OBJECT_MARGIN_M, 0, 0]
+    return candidates[~(bev_iou(candidates, enlarged_boxes) > 0).any(axis=1)]
 
 
 def _to_arrays(scene: CutScene) -> dict[str, np.ndarray]:

@@ -55,7 +55,7 @@ class ClusterSample:
 
 @dataclass(frozen=True)
 class ClusterPreparation:
-    """Preparation of a ClusterSample: random clusters of a scene are augmented.
+    """Function (scene, rng) that draws and augments random clusters of a scene to make a ClusterSample.
 
     Attributes:
         config: Configuration of the network.
@@ -117,8 +117,6 @@ def augment_clusters(
         clusters: K clusters, which are not changed.
         boxes: (K, 7) boxes.
         is_box_crop: (K,) bool, see CutScene.
-        params: Limits of the changes.
-        rng: Random generator.
 
     Returns:
         The changed clusters and boxes.
@@ -261,12 +259,12 @@ def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) ->
         boxes = restore_detections(boxes, SensorPoseParams(height=scene.height))
         report.update(FrameDetections(scene.name, scene.truth, boxes, scene.calibration))
     metrics, calibration = summarize_report(report, "bev", config.classes)
-    scored = (labels >= 0) & (sizes >= MIN_SCORED_POINTS)
-    probabilities, labels = np.concatenate([p.probabilities for p in predictions])[scored], labels[scored]
-    correct, is_object = probabilities.argmax(axis=1) == labels, labels < len(config.classes)
+    is_scored = (labels >= 0) & (sizes >= MIN_SCORED_POINTS)
+    probabilities, labels = np.concatenate([p.probabilities for p in predictions])[is_scored], labels[is_scored]
+    is_correct, is_object = probabilities.argmax(axis=1) == labels, labels < len(config.classes)
     return {
         **metrics,
-        "accuracy": 100 * float(correct.mean()) if len(correct) else math.nan,
-        "object_accuracy": 100 * float(correct[is_object].mean()) if is_object.any() else math.nan,
+        "accuracy": 100 * float(is_correct.mean()) if len(is_correct) else math.nan,
+        "object_accuracy": 100 * float(is_correct[is_object].mean()) if is_object.any() else math.nan,
         "calibration_error": compute_calibration_error(probabilities, labels),
     }, calibration

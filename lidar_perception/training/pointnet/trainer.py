@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,8 +17,9 @@ from lidar_perception.detectors.pointnet.network import PointNet
 from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.weights_file import find_pointnet_weights, find_proposer_weights, require_weights
 from lidar_perception.training.augment import TrainingScene
-from lidar_perception.training.data import Batches, Item, SceneReader, Stream, load_items
+from lidar_perception.training.data import Item, SceneReader, Stream, load_items
 from lidar_perception.training.params import PointNetTraining
+from lidar_perception.training.plan import Speed
 from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes, cut_clusters
 from lidar_perception.training.pointnet.task import (
     ClusterPreparation,
@@ -27,22 +28,18 @@ from lidar_perception.training.pointnet.task import (
     make_loss,
     validate_network,
 )
-from lidar_perception.training.record import load_initial_weights, make_save_function, report_skipped
+from lidar_perception.training.record import report_skipped
 from lidar_perception.training.request import PACKAGE
-from lidar_perception.training.run import Task, Validation
+from lidar_perception.training.run import Validation
 from lidar_perception.training.timing import find_readable_frame, measure_duration, measure_step, select_usable_scenes
-from lidar_perception.training.trainer import Cuts, StepSpeed
+from lidar_perception.training.trainer import Cuts
 from lidar_perception.types import InputError
 
 TIMED_FRAMES = 8  # frames to time validation with; several, so that the calibration matters little
 
 
 def find_proposer(params: PointNetTraining) -> Path | None:
-    """Return the path of the checkpoint in params.proposer, None if it is empty.
-
-    Raises:
-        InputError: The file is missing, or is not a PointPillars checkpoint.
-    """
+    """Return the path in params.proposer, None if empty. Raise InputError if it is not a PointPillars checkpoint."""
     if params.proposer in ("", str(PACKAGE)):
         return find_proposer_weights() if params.proposer else None
     path = require_weights(params.proposer, "proposer")
@@ -56,7 +53,7 @@ class PointNetTrainer:
     """Trainer of PointNet in one configuration; see Trainer for the methods."""
 
     config: PointNetConfig
-    cutting_title: str = "cutting clusters"
+    cutting_title = "cutting clusters"
 
     @property
     def name(self) -> str:
@@ -76,8 +73,8 @@ class PointNetTrainer:
 
     def measure_speed(
         self, params: PointNetTraining, scenes: Iterable[Item], val_sources: Sequence[Any], device: torch.device
-    ) -> StepSpeed:
-        """Measure durations on the clusters of the first usable scenes."""
+    ) -> Speed:
+        """Measure the speed on the clusters of the first usable scenes."""
         prepare = ClusterPreparation(self.config, params.augment)
         make_rng, proposer = partial(np.random.default_rng, 0), find_proposer(params)
 
@@ -89,10 +86,10 @@ class PointNetTrainer:
 
         usable_scenes = select_usable_scenes(scenes, prepare_scene)  # also compiles kernels
         cutting, cut_scenes = measure_duration(lambda: [cut_scene(scene) for scene in usable_scenes])
-        network = PointNet(self.config).to(device)
+        network = self.make_network().to(device)
         step = measure_step(
             network,
-            make_loss(self.config, device),
+            self.make_loss(params, device),
             lambda: [prepare(scene, make_rng()) for scene in cut_scenes],
             params,
             device,
@@ -108,7 +105,7 @@ class PointNetTrainer:
         with torch.no_grad():
             validate_network(network, [frame])
             validation, _ = measure_duration(lambda: validate_network(network, [frame] * TIMED_FRAMES))
-        return StepSpeed(cutting / len(usable_scenes), step, step, validation / TIMED_FRAMES)
+        return Speed(cutting / len(usable_scenes), step, step, validation / TIMED_FRAMES)
 
     def make_cuts(
         self, params: PointNetTraining, sources: Sequence[Any], val_sources: Sequence[Any], cache: Path
@@ -134,36 +131,22 @@ class PointNetTrainer:
         prepare = ClusterPreparation(self.config, params.augment, bool(params.proposer))
         return (Stream(tuple(training), prepare, params.seed), SceneReader(tuple(validation), load_validation_clusters))
 
-    def make_task(
-        self,
-        params: PointNetTraining,
-        batches: Batches,
-        val_scenes: SceneReader,
-        out: Path,
-        device: torch.device,
-        data_info: dict[str, Any],
-        commit: str,
-        init: Path | None,
-    ) -> Task:
-        torch.manual_seed(params.seed)
-        network = load_initial_weights(PointNet(self.config), init, PointNetConfig).to(device)
+    def make_network(self) -> PointNet:
+        return PointNet(self.config)
+
+    def make_loss(self, params: PointNetTraining, device: torch.device) -> Callable:
+        return make_loss(self.config, device)
+
+    def make_validate(
+        self, params: PointNetTraining, val_scenes: SceneReader, device: torch.device, jobs: int
+    ) -> Callable[[Any], Validation]:
         scenes: list[ValidationClusters] = []
 
         def validate(module: PointNet) -> Validation:
             if not scenes:
-                items = [
-                    item for (item,) in load_items(val_scenes, ([n] for n in range(len(val_scenes))), batches.jobs)
-                ]
+                items = [item for (item,) in load_items(val_scenes, ([n] for n in range(len(val_scenes))), jobs)]
                 scenes.extend(item.sample for item in items if item.sample is not None)
                 report_skipped([reason for item in items for reason in item.skipped], len(scenes), set())
             return validate_network(module, scenes)
 
-        return Task(
-            network,
-            make_loss(self.config, device),
-            batches,
-            validate,
-            make_save_function(out, self.config, params, batches, data_info, commit),
-            batches.steps_per_epoch,
-            data_info,
-        )
+        return validate

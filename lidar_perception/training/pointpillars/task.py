@@ -78,7 +78,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class ScenePreparation:
-    """Preparation of a Sample: augment and crop a scene, and add the expert columns.
+    """Function (scene, rng) that augments and crops a scene and adds the expert columns to make a Sample.
 
     Attributes:
         config: Configuration of the network.

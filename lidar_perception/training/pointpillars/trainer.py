@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -22,9 +22,10 @@ from lidar_perception.detectors.pointpillars.proposer import PointPillarsPropose
 from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.detectors.weights_file import find_pointpillars_weights
 from lidar_perception.training.cut_objects import CutObjects, cut_objects, join_databases
-from lidar_perception.training.data import Batches, Item, SceneReader, Stream
+from lidar_perception.training.data import Item, SceneReader, Stream
 from lidar_perception.training.database import Database
 from lidar_perception.training.params import PointPillarsTraining
+from lidar_perception.training.plan import Speed
 from lidar_perception.training.pointpillars.task import (
     VALIDATION_PARAMS,
     ScenePreparation,
@@ -34,10 +35,10 @@ from lidar_perception.training.pointpillars.task import (
     reduce_range,
     validate_detector,
 )
-from lidar_perception.training.record import load_initial_weights, make_save_function, report_skipped, summarize_report
-from lidar_perception.training.run import Task, Validation
+from lidar_perception.training.record import report_skipped, summarize_report
+from lidar_perception.training.run import Validation
 from lidar_perception.training.timing import find_readable_frame, measure_duration, measure_step, select_usable_scenes
-from lidar_perception.training.trainer import Cuts, StepSpeed
+from lidar_perception.training.trainer import Cuts
 from lidar_perception.types import InputError
 
 OBJECTS = "objects.npz"
@@ -50,7 +51,7 @@ class PointPillarsTrainer:
     """Trainer of PointPillars in one configuration; see Trainer for the methods."""
 
     config: NetworkConfig
-    cutting_title: str = "cutting objects"
+    cutting_title = "cutting objects"
 
     @property
     def name(self) -> str:
@@ -63,18 +64,18 @@ class PointPillarsTrainer:
     def find_max_cut_scenes(self, params: PointPillarsTraining) -> int:
         """Return the number of scenes from which objects are cut; 0 if no objects are pasted."""
         augment = params.augment
-        pasted = augment.crowded and (augment.cars or augment.pedestrians or augment.cyclists or augment.things)
-        return augment.database_scans if pasted else 0
+        has_objects = augment.cars or augment.pedestrians or augment.cyclists or augment.things
+        return augment.database_scans if augment.crowded and has_objects else 0
 
     def find_reduced_range(self, params: PointPillarsTraining) -> dict[str, Any]:
-        """Return the range that contains most objects; {} if the user gave a range."""
+        """Return a range that contains most objects; {} if the user gave a range."""
         ahead, aside = REDUCED_RANGES[params.range]
         return {} if params.ahead or params.aside else {"ahead": ahead, "aside": aside}
 
     def measure_speed(
         self, params: PointPillarsTraining, scenes: Iterable[Item], val_sources: Sequence[Any], device: torch.device
-    ) -> StepSpeed:
-        """Measure durations on the first usable scenes, with objects that are cut from them."""
+    ) -> Speed:
+        """Measure the speed on the first usable scenes, with objects that are cut from them."""
 
         def cut_all() -> list[Database]:
             return [cut_objects(scene, self.config.classes, params.data.min_points) for scene in usable_scenes]
@@ -86,8 +87,7 @@ class PointPillarsTrainer:
         usable_scenes = select_usable_scenes(scenes, lambda scene: prepare(scene, np.random.default_rng(0)))
         cut_objects(usable_scenes[0], self.config.classes, params.data.min_points)  # triggers compilation
         cutting, databases = measure_duration(cut_all)
-        network = make_network(self.config).to(device)
-        to_channels_last(network)
+        network = self.make_network().to(device)
         with tempfile.TemporaryDirectory() as folder:
             join_databases(databases).save(Path(folder) / OBJECTS)
             prepare_pasted = replace(
@@ -106,7 +106,7 @@ class PointPillarsTrainer:
         )
         full_range_step = step * np.prod(self.config.grid) / np.prod(reduced.grid)
         validation, _ = measure_duration(lambda: detect_in_frame(frame, detector))
-        return StepSpeed(cutting / len(usable_scenes), step, float(full_range_step), validation)
+        return Speed(cutting / len(usable_scenes), step, float(full_range_step), validation)
 
     def make_cuts(
         self, params: PointPillarsTraining, sources: Sequence[Any], val_sources: Sequence[Any], cache: Path
@@ -145,38 +145,23 @@ class PointPillarsTrainer:
         )
         return Stream(tuple(sources), prepare, params.seed), self._make_reader(val_sources)
 
-    def make_task(
-        self,
-        params: PointPillarsTraining,
-        batches: Batches,
-        val_scenes: SceneReader,
-        out: Path,
-        device: torch.device,
-        data_info: dict[str, Any],
-        commit: str,
-        init: Path | None,
-    ) -> Task:
-        torch.manual_seed(params.seed)
-        network = load_initial_weights(make_network(self.config), init, NetworkConfig)
-        network = to_channels_last(network.to(device))
-        reported: set[str] = set()
+    def make_network(self) -> PointPillars:
+        return to_channels_last(make_network(self.config))
+
+    def make_loss(self, params: PointPillarsTraining, device: torch.device) -> Callable:
+        return make_loss(reduce_range(self.config, params.ahead, params.aside), device)
+
+    def make_validate(
+        self, params: PointPillarsTraining, val_scenes: SceneReader, device: torch.device, jobs: int
+    ) -> Callable[[Any], Validation]:
+        reported_reasons: set[str] = set()
 
         def validate(module: PointPillars) -> Validation:
-            detector = self._make_detector(module, device)
-            report = validate_detector(detector, val_scenes, batches.jobs)
-            report_skipped(report.skipped, len(report.frames), reported)
+            report = validate_detector(self._make_detector(module, device), val_scenes, jobs)
+            report_skipped(report.skipped, len(report.frames), reported_reasons)
             return summarize_report(report, params.score, self.config.classes)
 
-        reduced = reduce_range(self.config, params.ahead, params.aside)
-        return Task(
-            network,
-            make_loss(reduced, device),
-            batches,
-            validate,
-            make_save_function(out, self.config, params, batches, data_info, commit),
-            batches.steps_per_epoch,
-            data_info,
-        )
+        return validate
 
     def _make_detector(self, network: PointPillars, device: torch.device) -> PointPillarsDetector:
         proposer = PointPillarsProposer(TorchNetwork(network, str(device)), Header(self.config), str(device))
