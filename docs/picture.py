@@ -21,7 +21,7 @@ from lidar_perception.ground.segment import segment_ground
 from lidar_perception.rendering.canvas import Canvas
 from lidar_perception.rendering.colors import BACKGROUND, color_by_cluster
 from lidar_perception.rendering.files import write_png
-from lidar_perception.rendering.picture import Boxes, Stage, draw_view, highlight_points
+from lidar_perception.rendering.picture import Boxes, RenderSettings, draw_view, highlight_points
 from lidar_perception.rendering.views import Perspective
 from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.scene import Scenes
@@ -41,7 +41,7 @@ def draw(path: Path, view: Perspective, xyz: np.ndarray, colors: np.ndarray, fou
     boxes = Boxes(found.boxes, found.class_ids)
     canvas = Canvas(view.width, view.height, BACKGROUND)
     colors = highlight_points(colors, xyz, boxes)
-    draw_view(canvas, view, Stage(50.0, True, -1.73), xyz, colors, boxes)
+    draw_view(canvas, view, RenderSettings(50.0, True, -1.73), xyz, colors, boxes)
     write_png(path, np.asarray(Image.fromarray(canvas.pixels).reduce(FINER)))
 
 

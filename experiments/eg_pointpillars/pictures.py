@@ -13,7 +13,7 @@ from experiments.framework.precision import RELAXED_BEV, compare_records
 from experiments.framework.trained_models import TrainedModel
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
+from lidar_perception.rendering.picture import Boxes, RenderSettings, draw_frame
 from lidar_perception.scoring.kitti.protocol import (
     COUNTED,
     METRICS,
@@ -104,5 +104,5 @@ def _draw(frame: Frame, model: TrainedModel, title: str) -> np.ndarray:
         if truth is None
         else truth.boxes[np.isin(truth.class_ids, [CLASSES.index(name) for name in SCORED])]
     )
-    stage = Stage.of(scan, frame.sensor_height, True, size=SIZE)
-    return draw_frame(stage, scan, boxes, labels, title)
+    settings = RenderSettings.of(scan, frame.sensor_height, True, size=SIZE)
+    return draw_frame(settings, scan, boxes, labels, title)

@@ -328,7 +328,7 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
     from lidar_perception.nodes.replay.graph_replay import TRACKS
     from lidar_perception.rendering.colors import color_by_cluster
     from lidar_perception.rendering.files import write_png
-    from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
+    from lidar_perception.rendering.picture import Boxes, RenderSettings, draw_frame
 
     counts = {  # (matches, labels) by stamp
         stamp: (len(match_centres(detections.boxes, truth)[0]), len(truth))
@@ -361,11 +361,11 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
         [str(i) if trails else "" for i in detections.ids],
         [trails.get(int(i), detections.boxes[k : k + 1, :3]) for k, i in enumerate(detections.ids)],
     )
-    stage = Stage.of(frame, height, not (detections.boxes[:, 0] < -MAX_BEHIND_M).any())
+    render_settings = RenderSettings.of(frame, height, not (detections.boxes[:, 0] < -MAX_BEHIND_M).any())
     write_png(
         out / "birdseye.png",
         draw_frame(
-            stage,
+            render_settings,
             frame,
             boxes,
             truth,

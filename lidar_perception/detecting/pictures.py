@@ -12,7 +12,7 @@ import numpy as np
 from lidar_perception.detecting.formats import Run
 from lidar_perception.detecting.results import FrameResult
 from lidar_perception.rendering.files import VideoFile, open_video, read_png_note, write_png
-from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
+from lidar_perception.rendering.picture import Boxes, RenderSettings, draw_frame
 
 LAST_FRAME_S = 0.1  # duration of a video's last frame
 MIN_FRAME_S, MAX_FRAME_S = 0.02, 0.5  # limits for the duration of the other frames
@@ -30,22 +30,22 @@ class FrameDrawer:
 
     def __init__(self, run: Run, color: str = "height", size: tuple[int, int] = (1280, 720)) -> None:
         self.run, self.color, self.size = run, color, size
-        self.stage: Stage | None = None
+        self.settings: RenderSettings | None = None
         self._first_ns = 0
         self._last_picture: tuple[str, np.ndarray] | None = None  # name of the frame and picture
 
-    def get_stage(self, result: FrameResult) -> Stage:
-        """Return the stage of the run; create it from the first result."""
-        if self.stage is None:
+    def get_settings(self, result: FrameResult) -> RenderSettings:
+        """Return the settings of the run; create them from the first result."""
+        if self.settings is None:
             self._first_ns = result.frame.stamp_ns
-            self.stage = Stage.of(
+            self.settings = RenderSettings.of(
                 result.frame.load(),
                 result.frame.sensor_height,
                 self.run.header.get("range") == "ahead",
                 self.color,
                 self.size,
             )
-        return self.stage
+        return self.settings
 
     def __call__(self, result: FrameResult) -> np.ndarray:
         """Return the picture (height, width, 3) uint8 of a result.
@@ -58,7 +58,7 @@ class FrameDrawer:
             truth = frame.truth()
             labels = np.zeros((0, 7)) if truth is None else truth.boxes
             picture = draw_frame(
-                self.get_stage(result),
+                self.get_settings(result),
                 frame.load(),
                 make_annotated_boxes(result),
                 labels,
@@ -114,9 +114,9 @@ class PictureWriter:
     def add(self, result: FrameResult) -> None:
         """Draw a frame and write the picture."""
         path = self.path / f"{result.frame.name}.png"
-        stage = repr(self.drawer.get_stage(result))
-        if read_png_note(path) != stage:
-            write_png(path, self.drawer(result), stage)
+        settings = repr(self.drawer.get_settings(result))
+        if read_png_note(path) != settings:
+            write_png(path, self.drawer(result), settings)
 
 
 class VideoWriter:

@@ -78,9 +78,9 @@ class Canvas:
         image = np.zeros((self.height + 2 * margin, stride, 4), np.uint8)
         image[margin:-margin, margin:-margin, :3] = self.pixels
         flat_pixels = image.view(np.uint32).ravel()
-        packed = np.zeros((len(order), 4), np.uint8)
-        packed[:, :3] = colors[order]
-        values = packed.view(np.uint32).ravel()
+        packed_colors = np.zeros((len(order), 4), np.uint8)
+        packed_colors[:, :3] = colors[order]
+        values = packed_colors.view(np.uint32).ravel()
         first_pixel = (cells[:, 1] + margin) * stride + cells[:, 0] + margin
         sides = np.clip(np.round(2 * radius[order]), 1, 2 * margin - 1).astype(np.int64)
         for side in np.unique(sides):  # from far to near points, because the radius does not increase with the depth
@@ -204,11 +204,11 @@ class Canvas:
             (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])
             for a, b in zip(corners, np.roll(corners, -1, axis=0))
         ]
-        inside = np.all([side >= 0 for side in edge_values], axis=0) | np.all(
+        is_inside = np.all([side >= 0 for side in edge_values], axis=0) | np.all(
             [side <= 0 for side in edge_values], axis=0
         )
         region = self.pixels[low[1] : high[1], low[0] : high[0]]
-        region[inside] = np.round(region[inside] * (1 - alpha) + np.asarray(color) * alpha)
+        region[is_inside] = np.round(region[is_inside] * (1 - alpha) + np.asarray(color) * alpha)
 
     def paste(self, other: Canvas, column: int, row: int) -> None:
         """Copy another canvas into this one, with its top left corner at (column, row)."""

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
 from PIL import Image, PngImagePlugin
@@ -25,11 +24,7 @@ QUALITY = {"crf": "20", "preset": "veryfast"}  # options of the H.264 encoder
 
 
 def write_png(path: Path, image: np.ndarray, note: str = "") -> None:
-    """Write an image (height, width, 3) uint8 with a note for read_png_note().
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write an image (height, width, 3) uint8 with a note. Raise InputError if the file cannot be written."""
     info, stream = PngImagePlugin.PngInfo(), io.BytesIO()
     info.add_text(PNG_KEY, note)
     Image.fromarray(image).save(stream, "png", pnginfo=info, compress_level=PNG_LEVEL)
@@ -43,13 +38,6 @@ def read_png_note(path: Path) -> str | None:
             return image.info.get(PNG_KEY)
     except OSError:
         return None
-
-
-class VideoFile(Protocol):
-    """Video that is open for writing."""
-
-    def add(self, image: np.ndarray, seconds: float) -> None:
-        """Add an image (height, width, 3) uint8 as a frame that is shown for `seconds`."""
 
 
 def check_video(path: Path, count: int) -> None:
@@ -79,7 +67,7 @@ def open_video(path: Path, size: tuple[int, int]) -> Iterator[VideoFile]:
     partial = path.with_name(f".{path.stem}.incomplete{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        writer: Any = _H264File(partial, size) if path.suffix in VIDEO_SUFFIXES else _AnimationFile(partial)
+        writer: VideoFile = _H264File(partial, size) if path.suffix in VIDEO_SUFFIXES else _AnimationFile(partial)
         yield writer
         if writer.ticks:
             writer.close()
@@ -105,6 +93,7 @@ class _H264File:
         self.ticks = 0
 
     def add(self, image: np.ndarray, seconds: float) -> None:
+        """Add an image (height, width, 3) uint8 as a frame that is shown for `seconds`."""
         frame = self.av.VideoFrame.from_ndarray(
             np.ascontiguousarray(image[: self.stream.height, : self.stream.width]), format="rgb24"
         )
@@ -126,6 +115,7 @@ class _AnimationFile:
         self.durations: list[int] = []  # frame durations in milliseconds
 
     def add(self, image: np.ndarray, seconds: float) -> None:
+        """Add an image (height, width, 3) uint8 as a frame that is shown for `seconds`."""
         frame = Image.fromarray(image)
         frame.thumbnail((ANIMATED_WIDTH, ANIMATED_WIDTH), Image.Resampling.LANCZOS)
         if self.path.suffix == ".gif":
@@ -137,3 +127,6 @@ class _AnimationFile:
     def close(self) -> None:
         first, *others = self.frames
         first.save(self.path, save_all=True, append_images=others, duration=self.durations, loop=0, quality=80)
+
+
+VideoFile = _H264File | _AnimationFile

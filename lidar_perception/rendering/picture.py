@@ -60,7 +60,7 @@ class Boxes:
 
 
 @dataclass(frozen=True)
-class Stage:
+class RenderSettings:
     """Settings shared by all images of a video.
 
     Attributes:
@@ -81,11 +81,11 @@ class Stage:
     @staticmethod
     def of(
         scan: PointCloud, sensor_height: float, ahead: bool, color: str = "height", size: tuple[int, int] = (1280, 720)
-    ) -> Stage:
+    ) -> RenderSettings:
         """Choose the settings for a video, given its first scan."""
         typical_range = np.percentile(horizontal_range(scan.xyz), RANGE_PERCENTILE) if len(scan) else MIN_RANGE
         extent = float(np.clip(typical_range, MIN_RANGE, MAX_RANGE_AHEAD if ahead else MAX_RANGE_AROUND))
-        return Stage(extent, ahead, -sensor_height, color, *size)
+        return RenderSettings(extent, ahead, -sensor_height, color, *size)
 
     @property
     def views(self) -> tuple[Perspective, BirdsEye]:
@@ -126,7 +126,7 @@ class Stage:
 
 
 def draw_frame(
-    stage: Stage,
+    settings: RenderSettings,
     scan: PointCloud,
     boxes: Boxes,
     labels: np.ndarray = NO_BOXES,
@@ -137,26 +137,27 @@ def draw_frame(
     """Draw a frame as an image (height, width, 3) uint8 [r g b].
 
     Args:
-        stage: Settings of the image.
+        settings: Settings of the image.
         scan: Cloud of N points.
         boxes: Boxes to draw.
         labels: (L, 7) labelled boxes, which are drawn with dashed lines.
         title, time: Texts at the top left and right.
-        colors: (N, 3) uint8 colours of the points; None for the colours of `stage`.
+        colors: (N, 3) uint8 colours of the points; None for the colours of `settings`.
     """
     with_scale = colors is None
-    colors = highlight_points(stage.color_points(scan) if colors is None else colors, scan.xyz, boxes)
-    image = Canvas(stage.width, stage.height, BACKGROUND)
-    left_column, texts = 0, _make_heading(stage, title, time)
-    for view in stage.views:
+    colors = highlight_points(settings.color_points(scan) if colors is None else colors, scan.xyz, boxes)
+    image = Canvas(settings.width, settings.height, BACKGROUND)
+    left_width = settings.views[0].width
+    texts = [Text((16, 14), title, TEXT, 15, "lt"), Text((left_width - 16, 14), time, DIM, 15, "rt")]
+    left_column = 0
+    for view in settings.views:
         canvas = Canvas(view.width, view.height, BACKGROUND)
-        view_texts = draw_view(canvas, view, stage, scan.xyz, colors, boxes, labels)
+        view_texts = draw_view(canvas, view, settings, scan.xyz, colors, boxes, labels)
         image.paste(canvas, left_column, 0)
         texts += [text.shift(left_column) for text in view_texts]
         left_column += view.width
-    left_width = stage.views[0].width
-    image.draw_lines([[[left_width, 0], [left_width, stage.height]]], GRID, 1.5)
-    image.draw_texts([*texts, *_draw_legend(image, stage, boxes, labels, with_scale)])
+    image.draw_lines([[[left_width, 0], [left_width, settings.height]]], GRID, 1.5)
+    image.draw_texts([*texts, *_draw_legend(image, settings, boxes, labels, with_scale)])
     return image.pixels
 
 
@@ -165,15 +166,15 @@ def highlight_points(colors: np.ndarray, xyz: np.ndarray, boxes: Boxes) -> np.nd
     colors = colors.copy()
     rows, first_rows = points_in_boxes(xyz, boxes.boxes, 0.1)
     for k, class_id in enumerate(boxes.class_ids):
-        inside = rows[first_rows[k] : first_rows[k + 1]]
-        colors[inside] = CLASS_COLOR_WEIGHT * np.array(get_class_color(class_id)) + (1 - CLASS_COLOR_WEIGHT) * 240
+        indices = rows[first_rows[k] : first_rows[k + 1]]
+        colors[indices] = CLASS_COLOR_WEIGHT * np.array(get_class_color(class_id)) + (1 - CLASS_COLOR_WEIGHT) * 240
     return colors
 
 
 def draw_view(
     canvas: Canvas,
     view: View,
-    stage: Stage,
+    settings: RenderSettings,
     xyz: np.ndarray,
     colors: np.ndarray,
     detections: Boxes,
@@ -184,11 +185,11 @@ def draw_view(
     Returns:
         The texts to draw on top.
     """
-    texts = _draw_rings(canvas, view, stage)
+    texts = _draw_rings(canvas, view, settings)
     pixels, depth = view.project(xyz)
     in_front = np.flatnonzero(depth > NEAR)
     canvas.draw_points(pixels[in_front], depth[in_front], colors[in_front], view.find_radii(depth[in_front]))
-    _draw_sensor(canvas, view, stage)
+    _draw_sensor(canvas, view, settings)
     box_colors = np.array([get_class_color(c) for c in detections.class_ids], float).reshape(-1, 3)
     boxes = detections.boxes.astype(float)
     _draw_trails(canvas, view, detections, box_colors)
@@ -203,28 +204,29 @@ def draw_view(
     return texts + _make_box_texts(view, detections)
 
 
-def _draw_rings(canvas: Canvas, view: View, stage: Stage) -> list[Text]:
+def _draw_rings(canvas: Canvas, view: View, settings: RenderSettings) -> list[Text]:
     """Draw range rings on the ground; return their captions."""
     angles = np.linspace(0, 2 * np.pi, RING_POINTS)
     circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(RING_POINTS)], axis=1)
     arcs = np.stack([circle[:-1], circle[1:]], axis=1)
-    circles = stage.ring_radii[:, None, None, None] * arcs + [0, 0, stage.ground]
+    circles = settings.ring_radii[:, None, None, None] * arcs + [0, 0, settings.ground]
     canvas.draw_lines(project_lines(view, circles.reshape(-1, 2, 3)), GRID, 1.2)
     text_positions = np.stack(
-        [stage.ring_radii * 0.8, stage.ring_radii * -0.6, np.full(len(stage.ring_radii), stage.ground)], axis=1
+        [settings.ring_radii * 0.8, settings.ring_radii * -0.6, np.full(len(settings.ring_radii), settings.ground)],
+        axis=1,
     )
     return [
         Text(pixel, f"{radius:g} m", DIM, 11)
-        for pixel, depth, radius in zip(*view.project(text_positions), stage.ring_radii)
+        for pixel, depth, radius in zip(*view.project(text_positions), settings.ring_radii)
         if depth > NEAR and _has_room(view, pixel)
     ]
 
 
-def _draw_sensor(canvas: Canvas, view: View, stage: Stage) -> None:
+def _draw_sensor(canvas: Canvas, view: View, settings: RenderSettings) -> None:
     """Draw an arrowhead at the position of the sensor that points forward."""
-    size = 0.013 * stage.reach
+    size = 0.013 * settings.reach
     corners = np.array([[1.6, 0, 0], [-1, 1, 0], [-0.4, 0, 0], [-1, -1, 0]]) * size
-    pixels, depth = view.project(corners + [0, 0, stage.ground])
+    pixels, depth = view.project(corners + [0, 0, settings.ground])
     if (depth > NEAR).all() and all(_has_room(view, end) for end in pixels):
         canvas.fill_polygon(pixels[[0, 1, 2]], TEXT, 0.9)
         canvas.fill_polygon(pixels[[0, 2, 3]], TEXT, 0.7)
@@ -291,18 +293,15 @@ def _has_room(view: View, pixel: np.ndarray) -> bool:
     return bool(12 <= pixel[0] < view.width - 12 and 0 <= pixel[1] < view.height)
 
 
-def _make_heading(stage: Stage, title: str, time: str) -> list[Text]:
-    left_width = stage.views[0].width
-    return [Text((16, 14), title, TEXT, 15, "lt"), Text((left_width - 16, 14), time, DIM, 15, "rt")]
-
-
-def _draw_legend(canvas: Canvas, stage: Stage, boxes: Boxes, labels: np.ndarray, with_scale: bool) -> list[Text]:
+def _draw_legend(
+    canvas: Canvas, settings: RenderSettings, boxes: Boxes, labels: np.ndarray, with_scale: bool
+) -> list[Text]:
     """Draw the legend: classes with box counts, the dashed line of labels, and the colour scale.
 
     Returns:
         The texts to draw on top.
     """
-    items, x, y = [], 18.0, stage.height - 20.0
+    items, x, y = [], 18.0, settings.height - 20.0
     entries = [
         (f"{CLASSES[c]} {np.count_nonzero(boxes.class_ids == c)}", get_class_color(c), False)
         for c in np.unique(boxes.class_ids).tolist()
@@ -315,16 +314,16 @@ def _draw_legend(canvas: Canvas, stage: Stage, boxes: Boxes, labels: np.ndarray,
         x += 50 + 8.2 * len(text)
     if not with_scale:
         return items
-    scale_right = stage.views[0].width - 80
+    scale_right = settings.views[0].width - 80
     if x > scale_right - SCALE_WIDTH - 80:  # not enough width for one row
         y -= 24
     scale_top = int(y) - 4
-    low, high, unit = (0, 1, "") if stage.color == "intensity" else (0, 4, " m")
+    low, high, unit = (0, 1, "") if settings.color == "intensity" else (0, 4, " m")
     values = np.linspace(low, high, SCALE_WIDTH)
-    bar = color_by_intensity(values) if stage.color == "intensity" else color_by_height(values)
+    bar = color_by_intensity(values) if settings.color == "intensity" else color_by_height(values)
     canvas.pixels[scale_top : scale_top + 8, scale_right - SCALE_WIDTH : scale_right] = bar
     return [
         *items,
-        Text((scale_right - SCALE_WIDTH - 6, y), f"{stage.color} {low}", DIM, 12, "rm"),
+        Text((scale_right - SCALE_WIDTH - 6, y), f"{settings.color} {low}", DIM, 12, "rm"),
         Text((scale_right + 6, y), f"{high}{unit}", DIM, 12, "lm"),
     ]

@@ -4,30 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
 NEAR = 0.3  # distance of the near clipping plane in metres
-
-
-class View(Protocol):
-    """Projection onto an image of width x height pixels."""
-
-    @property
-    def width(self) -> int: ...
-
-    @property
-    def height(self) -> int: ...
-
-    def project(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project points (..., 3); return their pixels (..., 2) [column row] and depths (...).
-
-        Points with a depth below NEAR must not be drawn.
-        """
-
-    def find_radii(self, depth: np.ndarray) -> np.ndarray:
-        """Return the radius in pixels of points at these depths (N,)."""
+EYE_HEIGHT = 1000.0  # z of the eye of the bird's-eye view in metres
 
 
 @dataclass(frozen=True)
@@ -64,6 +45,10 @@ class Perspective:
         return np.stack([right * self.focal, np.cross(forward, right) * self.focal, forward], axis=1)
 
     def project(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Project points (..., 3) to pixels (..., 2) [column row] and depths (...).
+
+        Points with a depth below NEAR must not be drawn.
+        """
         axes = self.axes
         camera_points = xyz @ axes.astype(xyz.dtype) - (self.eye @ axes).astype(xyz.dtype)
         depth = camera_points[..., 2]
@@ -72,6 +57,7 @@ class Perspective:
         return pixels, depth
 
     def find_radii(self, depth: np.ndarray) -> np.ndarray:
+        """Return the radius in pixels of points at these depths (N,)."""
         return np.clip(self.point_radius * self.focal / np.maximum(depth, NEAR), 0.5, 3.0)
 
 
@@ -83,22 +69,25 @@ class BirdsEye:
         centre: x and y at the centre of the image, metres.
         scale: Pixels per metre.
         width, height: Size of the image in pixels.
-        eye_height: z of the eye in the LiDAR frame, metres.
     """
 
     centre: tuple[float, float]
     scale: float
     width: int
     height: int
-    eye_height: float = 1000.0
 
     def project(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Project points (..., 3) to pixels (..., 2) [column row] and depths (...)."""
         origin_pixel = [self.width / 2 + self.centre[1] * self.scale, self.height / 2 + self.centre[0] * self.scale]
         pixels = np.array(origin_pixel, xyz.dtype) - xyz[..., 1::-1] * xyz.dtype.type(self.scale)
-        return pixels, self.eye_height - xyz[..., 2]
+        return pixels, EYE_HEIGHT - xyz[..., 2]
 
     def find_radii(self, depth: np.ndarray) -> np.ndarray:
+        """Return the radius in pixels of points at these depths (N,)."""
         return np.full(np.shape(depth), 0.75)
+
+
+View = Perspective | BirdsEye
 
 
 def project_lines(view: View, lines: np.ndarray) -> np.ndarray:

@@ -32,14 +32,13 @@ def check_regular(path: Path) -> Path:
 
 
 MAX_TEXT_BYTES = 2**28  # maximum size of a file of numbers or labels
+MAX_LINE = 200  # maximum length of an error message
 
 
 def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES, noun: str = "") -> str:
     """Read a UTF-8 text file of at most max_bytes and drop its byte order mark.
 
     Args:
-        path: The file.
-        max_bytes: Maximum size of the file.
         noun: Description of the file in error messages.
 
     Raises:
@@ -72,10 +71,10 @@ def convert_os_errors() -> Iterator[None]:
         raise InputError(f"{error.filename}: {error.strerror}") from error
 
 
-def shorten_error(error: BaseException, length: int = 200) -> str:
-    """Return the first line of an error message, cut to `length` characters; the type if it is empty."""
+def shorten_error(error: BaseException) -> str:
+    """Return the first line of an error message, cut to MAX_LINE characters; the type if it is empty."""
     line = (str(error).strip().splitlines() or [type(error).__name__])[0]
-    return line if len(line) <= length else f"{line[: length - 3]}..."
+    return line if len(line) <= MAX_LINE else f"{line[: MAX_LINE - 3]}..."
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -84,11 +83,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
-    """Write a file atomically: after an error or a crash, it still has its old content.
-
-    Raises:
-        InputError: The file cannot be written.
-    """
+    """Write a file atomically, so that it is never incomplete. Raise InputError if it cannot be written."""
     path = Path(path)
     temporary = _make_temporary_path(path)
     try:
@@ -182,11 +177,7 @@ def check_writable_folder(path: Path) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder and its parents if needed.
-
-    Raises:
-        InputError: The folder cannot be created or written to.
-    """
+    """Create a folder and its parents if needed. Raise InputError if it cannot be created or written to."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         if not os.access(path, os.W_OK | os.X_OK):
@@ -203,7 +194,6 @@ def remove_temporaries(folder: Path, *names: str) -> None:
     No other process may write to the folder at the same time.
 
     Args:
-        folder: The folder.
         names: Patterns of the names of the final files.
     """
     for path in folder.glob(".*.tmp"):

@@ -75,7 +75,6 @@ def open_journal(
     Frames that an earlier run skipped are not in the journal, so that they are processed again.
 
     Args:
-        folder: The folder.
         plan: Settings of the run.
         force: Start over.
         list_files: Function that lists the other files of an earlier run, which force removes.

@@ -95,8 +95,8 @@ def run_in_order(
     Args:
         max_ahead: Maximum number of items that each process works ahead of the caller.
     """
-    remaining = iter(items)
-    first_items = list(islice(remaining, jobs * max_ahead))
+    remaining_items = iter(items)
+    first_items = list(islice(remaining_items, jobs * max_ahead))
     context = _make_context(start)
     process_by_pipe: dict[Connection, ForkServerProcess] = {}
     try:
@@ -108,7 +108,7 @@ def run_in_order(
         while pending:
             pipe = pending.popleft()
             for result in _receive_result(pipe, process_by_pipe, work_done):
-                pending += [_send_item(pipe, item) for item in islice(remaining, 1)]
+                pending += [_send_item(pipe, item) for item in islice(remaining_items, 1)]
                 yield result
     finally:
         _end_processes(process_by_pipe)
@@ -159,11 +159,7 @@ def _find_modules(work: Any) -> set[str]:
 def _receive_result(
     receiver: Connection, process_by_pipe: dict[Connection, ForkServerProcess], work_done: str
 ) -> Iterator:
-    """Receive a result; yield it, or nothing if the process has ended normally.
-
-    Raises:
-        InputError: The process failed or died.
-    """
+    """Yield a result, or nothing if the process has ended normally. Raise InputError if it failed or died."""
     try:
         result, error = receiver.recv()
     except (EOFError, OSError):  # OSError if the result is cut off

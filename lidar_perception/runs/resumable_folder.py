@@ -37,7 +37,6 @@ def make_resumable_folder(
     after an exception in the block it can be resumed.
 
     Args:
-        folder: The folder.
         settings: Settings of the data set; settings["frames"] is the number of frames.
         names: Names of the files and folders of the data set, which force replaces.
         resume: Continue an interrupted run.
@@ -65,7 +64,6 @@ def finish_frame(folder: Path, number: int, parts: dict[str, str]) -> None:
     """Mark a frame as finished; call this after all its files are written.
 
     Args:
-        folder: The folder.
         number: Number of the frame.
         parts: Text that the frame adds to files of many frames, by path in the folder. The parts
             are joined in the order of the frames.
@@ -102,11 +100,11 @@ def _prepare_folder(folder: Path, settings: dict, names: Iterable[str], resume: 
 def _check_settings(folder: Path, settings: dict) -> None:
     path = folder / (RECORD_NAME if is_finished(folder) else INCOMPLETE_NAME)
     try:
-        recorded = json.loads(path.read_text())
-        differences = find_differences(recorded, {k: v for k, v in settings.items() if k != "command"})
+        old_settings = json.loads(path.read_text())
+        differences = find_differences(old_settings, {k: v for k, v in settings.items() if k != "command"})
     except (OSError, ValueError, AttributeError) as error:
         raise InputError(f"cannot read {path}: {error}; use --force to start again") from None
-    if not recorded:
+    if not old_settings:
         raise InputError(f"{folder} is incomplete because --force was interrupted; start again with --force")
     if differences:
         raise InputError(

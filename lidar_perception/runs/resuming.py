@@ -59,22 +59,18 @@ def lock_folder(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def find_differences(recorded: dict[str, Any], requested: dict[str, Any]) -> list[str]:
-    """Describe each setting that differs, such as "frames 5, not 6".
+def find_differences(old_settings: dict[str, Any], settings: dict[str, Any]) -> list[str]:
+    """Describe each setting that differs from an earlier run, such as "frames 5, not 6".
 
-    Settings in nested dicts have dotted names. Settings that are only in `recorded` are ignored.
-
-    Args:
-        recorded: Settings of the earlier run.
-        requested: Settings of this run.
+    Settings in nested dicts have dotted names. Settings that only the earlier run has are ignored.
     """
     differences = []
-    for key, value in requested.items():
-        recorded_value = recorded.get(key)
-        if isinstance(value, dict) and isinstance(recorded_value, dict):
-            differences += [f"{key}.{line}" for line in find_differences(recorded_value, value)]
-        elif recorded_value != value:
-            differences.append(f"{key} {recorded_value!r}, not {value!r}")
+    for key, value in settings.items():
+        old_value = old_settings.get(key)
+        if isinstance(value, dict) and isinstance(old_value, dict):
+            differences += [f"{key}.{line}" for line in find_differences(old_value, value)]
+        elif old_value != value:
+            differences.append(f"{key} {old_value!r}, not {value!r}")
     return differences
 
 

@@ -164,10 +164,6 @@ def show_progress(items: Iterable, description: str, total: int) -> Iterator:
 
 def format_duration(seconds: float) -> str:
     """Format a duration for display, such as 40 s, 12 min or 1.5 h."""
-    return (
-        f"{seconds:.0f} s"
-        if seconds < 90
-        else f"{seconds / 60:.0f} min"
-        if seconds < 5400
-        else f"{seconds / 3600:.1f} h"
-    )
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -21,5 +21,5 @@ def test_pictures_show_the_time(stamp, timed, expected, tmp_path):
     frames = [Frame.of(str(i), cloud_frame(scene(i), stamp + i * 10**9 - 15 * 10**8)) for i in range(2)]
     run = make_run(Recording(tmp_path / "drive", "", frames, has_times=timed), tmp_path / "out")
     drawer = FrameDrawer(run)
-    drawer.get_stage(FrameResult(frames[0], Detections.none(), "velodyne", 1.0))
+    drawer.get_settings(FrameResult(frames[0], Detections.none(), "velodyne", 1.0))
     assert drawer.format_time(stamp) == expected

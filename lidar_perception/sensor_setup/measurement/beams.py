@@ -84,10 +84,14 @@ def _label_by_order(scans: Sequence[Scan]) -> list[np.ndarray] | None:
         for seam in (0.0, 180.0, float(scan.azimuth[0]) - 0.5):
             azimuth = (scan.azimuth - seam) % 360.0
             step = np.diff(azimuth)
-            forward = step if np.median(step) >= 0 else -step
-            starts = forward < -30.0  # a jump back, where the next beam starts
+            forward_step = step if np.median(step) >= 0 else -step
+            starts = forward_step < -30.0  # a jump back, where the next beam starts
             count = int(starts.sum()) + 1
-            if not 4 <= count <= MAX_BEAMS or len(azimuth) / count < MIN_BEAM_POINTS or ((forward < 0).mean() > 0.1):
+            if (
+                not 4 <= count <= MAX_BEAMS
+                or len(azimuth) / count < MIN_BEAM_POINTS
+                or ((forward_step < 0).mean() > 0.1)
+            ):
                 continue
             label = np.concatenate([[0], np.cumsum(starts)])
             parts = np.split(scan.elevation, np.flatnonzero(starts) + 1)
@@ -116,21 +120,23 @@ def _label_by_elevation(scans: Sequence[Scan]) -> list[np.ndarray] | None:
     # Thresholds are relative to several peaks: the highest may be two beams with the same elevation.
     reference = np.sort(counts)[-20:].mean()
     peaks, _ = find_peaks(counts, height=0.01 * reference, prominence=0.005 * reference)
-    isolated = [p for p, q in zip(peaks, peak_prominences(counts, peaks)[0]) if q > 0.5 * counts[p]]
-    if not 2 <= len(isolated) <= MAX_BEAMS:
+    isolated_peaks = [p for p, q in zip(peaks, peak_prominences(counts, peaks)[0]) if q > 0.5 * counts[p]]
+    if not 2 <= len(isolated_peaks) <= MAX_BEAMS:
         return None
-    centers = (edges[:-1] + edges[1:])[isolated] / 2
+    centers = (edges[:-1] + edges[1:])[isolated_peaks] / 2
     borders = np.concatenate([[-90.0], (centers[1:] + centers[:-1]) / 2, [90.0]])
     spacing = float(np.median(np.minimum(np.diff(borders)[1:-1], 2.0) if len(centers) > 2 else np.diff(centers)))
-    highest = len(centers) - 1
-    nearest = np.clip(np.searchsorted(borders, points) - 1, 0, highest)
-    is_near_peak: np.ndarray = np.abs(points - centers[nearest]) < spacing / 4
+    last_peak = len(centers) - 1
+    nearest_peak = np.clip(np.searchsorted(borders, points) - 1, 0, last_peak)
+    is_near_peak: np.ndarray = np.abs(points - centers[nearest_peak]) < spacing / 4
     if is_near_peak.mean() < MIN_PEAK_FRACTION:
         return None
     labels = []
     for elevation in elevations:
-        nearest = np.clip(np.searchsorted(borders, elevation) - 1, 0, highest)
-        labels.append(np.where(np.abs(elevation - centers[nearest]) < max(spacing / 2, 0.1), highest - nearest, -1))
+        nearest_peak = np.clip(np.searchsorted(borders, elevation) - 1, 0, last_peak)
+        labels.append(
+            np.where(np.abs(elevation - centers[nearest_peak]) < max(spacing / 2, 0.1), last_peak - nearest_peak, -1)
+        )
     return labels
 
 
@@ -180,18 +186,18 @@ def _fit_beams(scans: Sequence[Scan], labels: list[np.ndarray], method: str) -> 
         error[n] = 1.2533 * 1.4826 * _mad(medians) / np.sqrt(len(medians))
         if lifts.any() and not is_reliable[n]:
             error[n] += np.degrees(MAX_LIFT_ERROR_M / np.median(beam.distance))
-    descending = np.argsort(-elevations, kind="stable")
+    beam_order = np.argsort(-elevations, kind="stable")
     # Beams with equal elevations count as one.
     rank = np.empty(len(has_points), np.int64)
-    rank[descending] = np.cumsum(np.concatenate([[0], np.diff(-elevations[descending]) > ANGLE_RESOLUTION]))
-    unique = descending[np.unique(rank[descending], return_index=True)[1]]
+    rank[beam_order] = np.cumsum(np.concatenate([[0], np.diff(-elevations[beam_order]) > ANGLE_RESOLUTION]))
+    unique_beams = beam_order[np.unique(rank[beam_order], return_index=True)[1]]
     beam_of_label = np.full(int(label_values.max()) + 2, -1)
     beam_of_label[label_values[has_points]] = rank
     return Beams(
-        elevations[unique],
-        lifts[unique],
-        spread[unique],
-        error[unique],
+        elevations[unique_beams],
+        lifts[unique_beams],
+        spread[unique_beams],
+        error[unique_beams],
         [beam_of_label[label] for label in labels],
         method,
     )
@@ -273,7 +279,6 @@ def measure_range_noise(scans: Sequence[Scan], beams: Beams, step: float) -> flo
     frequent residual, because residuals on rough surfaces are larger.
 
     Args:
-        scans: The scans.
         beams: Beams of their points.
         step: Azimuth step in degrees.
     """

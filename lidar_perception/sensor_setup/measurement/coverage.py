@@ -96,17 +96,16 @@ def find_nearest_returns(scans: Sequence[Scan], beams: Beams | None) -> NearestR
 
 
 def measure_coverage(
-    scans: Sequence[Scan], nearest: NearestReturns, mount: Mount | None, stationary: bool | None
+    scans: Sequence[Scan], nearest_returns: NearestReturns, mount: Mount | None, stationary: bool | None
 ) -> Coverage:
     """Measure the field of view, blind sectors and the robot's body from all scans together.
 
     Args:
-        scans: The scans.
-        nearest: Nearest returns of the scans.
+        nearest_returns: Nearest returns of the scans.
         mount: Mount of the sensor; None if unknown.
         stationary: True if the robot stands still; None if unknown.
     """
-    rows, labels, ranges = nearest
+    rows, labels, ranges = nearest_returns
     return_fraction = np.isfinite(ranges).mean(axis=0)
     body, median = _find_body(ranges, rows, mount, stationary)
     masks, box = _select_body(scans, labels, body, median)
@@ -126,9 +125,8 @@ def measure_coverage(
         if mount is None
         else (_compute_cell_directions(rows) @ mount.normal * MAX_GROUND_RANGE_M < -mount.height)
     )
-    is_towards_ground |= (
-        not is_towards_ground.any()
-    )  # if no cell reaches the ground, as on a tall vehicle, all cells count
+    if not is_towards_ground.any():  # on a tall vehicle, no cell may reach the ground
+        is_towards_ground[:] = True
     in_view = (return_fraction > 0).any(axis=0) | ~is_towards_ground.any(axis=0)
     in_box = [~select_points(scan.xyz, CropParams(body=tuple(box.tolist()))) for scan in scans]
     foreign_fraction = float(sum((i & ~m).sum() for i, m in zip(in_box, masks)) / max(1, sum(i.sum() for i in in_box)))
@@ -159,7 +157,6 @@ def _select_body(
     """Select the points on the body.
 
     Args:
-        scans: The scans.
         labels: Row of each point of each scan.
         body: (R, 360) bool, cells of the body.
         median: (R, 360) median range of each cell, m.
@@ -252,14 +249,14 @@ def _compute_cell_directions(rows: np.ndarray) -> np.ndarray:
 
 
 def _find_blocked(
-    blind: np.ndarray, in_view: np.ndarray, return_fraction: np.ndarray, body: np.ndarray
+    is_blind: np.ndarray, in_view: np.ndarray, return_fraction: np.ndarray, body: np.ndarray
 ) -> list[tuple[int, float, float]]:
     """Find sectors in which a beam and all lower beams are blind.
 
     Beams with few returns, such as those into the sky, cannot show blind sectors and are ignored.
 
     Args:
-        blind: (R, 360) bool, cells without a view.
+        is_blind: (R, 360) bool, cells without a view.
         in_view: (360,) bool; in all other sectors, all beams are blind.
         return_fraction: See Coverage.
         body: (R, 360) bool, cells that the body hides.
@@ -267,6 +264,7 @@ def _find_blocked(
     Returns:
         (first row, from, to) of each sector, in degrees.
     """
+    row_count = len(is_blind)
     is_informative = (
         (return_fraction[:, in_view] > 0).mean(axis=1) >= MIN_SEEN_FRACTION
         if in_view.any()
@@ -275,23 +273,25 @@ def _find_blocked(
     if not is_informative.any():
         return []
     # The lowest informative beam with a return in each sector.
-    hidden = np.where(is_informative[:, None], blind, True)
-    lowest = len(blind) - np.cumprod(hidden[::-1], axis=0).sum(axis=0)
-    candidates = np.append(np.flatnonzero(is_informative), len(blind))
-    first_row = candidates[np.searchsorted(candidates, lowest)]
-    for row in range(len(blind) - 2, -1, -1):  # add rows that the body hides
+    is_hidden = np.where(is_informative[:, None], is_blind, True)
+    lowest_row = row_count - np.cumprod(is_hidden[::-1], axis=0).sum(axis=0)
+    candidates = np.append(np.flatnonzero(is_informative), row_count)
+    first_row = candidates[np.searchsorted(candidates, lowest_row)]
+    for row in range(row_count - 2, -1, -1):  # add rows that the body hides
         first_row = np.where((first_row == row + 1) & body[row], row, first_row)
     first_row = np.where(in_view, first_row, 0)
     sectors = []
-    step = max(1, len(blind) // 16)  # rounding of rows, so that adjacent sectors merge
-    level = np.where(first_row < len(blind), -(-first_row // step) * step, len(blind))
-    level = np.minimum(level, np.where(first_row < len(blind), len(blind) - 1, len(blind)))
+    step = max(1, row_count // 16)  # rounding of rows, so that adjacent sectors merge
+    level = np.where(first_row < row_count, -(-first_row // step) * step, row_count)
+    level = np.minimum(level, np.where(first_row < row_count, row_count - 1, row_count))
     shift = int(np.argmax(np.diff(level, prepend=level[-1]) != 0))
-    rolled = np.roll(level, -shift)
-    starts = np.flatnonzero(np.diff(rolled, prepend=-1) != 0)
+    rolled_levels = np.roll(level, -shift)
+    starts = np.flatnonzero(np.diff(rolled_levels, prepend=-1) != 0)
     for start, end in zip(starts, [*starts[1:], SECTORS]):
-        if rolled[start] < len(blind) and end - start >= MIN_BLIND:
-            sectors.append((int(rolled[start]), float((start + shift) % 360), float((end + shift - 1) % 360 + 1)))
+        if rolled_levels[start] < row_count and end - start >= MIN_BLIND:
+            sectors.append(
+                (int(rolled_levels[start]), float((start + shift) % 360), float((end + shift - 1) % 360 + 1))
+            )
     return sorted(sectors)
 
 
@@ -300,10 +300,10 @@ def _find_view(in_view: np.ndarray) -> tuple[float, float]:
     if not in_view.any() or in_view.all():
         return 0.0, 360.0
     shift = int(np.argmax(in_view))
-    rolled = np.roll(in_view, -shift)
-    edges = np.flatnonzero(np.diff(rolled.astype(int), append=1))
+    rolled_view = np.roll(in_view, -shift)
+    edges = np.flatnonzero(np.diff(rolled_view.astype(int), append=1))
     ends, starts = edges[0::2], edges[1::2]
-    widest = int(np.argmax(starts - ends))
-    if starts[widest] - ends[widest] < MIN_BLIND:
+    widest_gap = int(np.argmax(starts - ends))
+    if starts[widest_gap] - ends[widest_gap] < MIN_BLIND:
         return 0.0, 360.0
-    return float((starts[widest] + 1 + shift) % 360), float((ends[widest] + 1 + shift) % 360)
+    return float((starts[widest_gap] + 1 + shift) % 360), float((ends[widest_gap] + 1 + shift) % 360)

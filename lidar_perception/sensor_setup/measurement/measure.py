@@ -176,15 +176,15 @@ def measure_sensor(
     require_3d(np.concatenate([scan.elevation for scan in scans]), source)
     pattern = _measure_pattern(scans)
     mount = measure_mount(scans)
-    nearest = find_nearest_returns(scans, pattern.beams)
+    nearest_returns = find_nearest_returns(scans, pattern.beams)
     # In uniform surroundings, such as a field, returns are constant although the robot moves.
-    stationary = False if recorded.distance >= MIN_POSE_MOTION_M else is_stationary(nearest.ranges)
+    stationary = False if recorded.distance >= MIN_POSE_MOTION_M else is_stationary(nearest_returns.ranges)
     heading = _find_heading(scans, numbers, mount, stationary, recorded)
     # People and doors change the surroundings although the robot stands still.
     stationary = (
         True if len(scans) > 1 and _measure_distance(scans, mount, heading, recorded) < MIN_MOTION_M else stationary
     )
-    view = _measure_view(scans, measure_coverage(scans, nearest, mount, stationary))
+    view = _measure_view(scans, measure_coverage(scans, nearest_returns, mount, stationary))
     # Level beams are also in a plane through the origin.
     may_be_on_ground = mount is None and (pattern.beams is None or pattern.is_moved)
     return SensorMeasurement(

@@ -28,6 +28,7 @@ MIN_HEIGHT_M = 0.1  # minimum height of the sensor; closer surfaces belong to it
 UPSIDE_DOWN_RATIO = 8.0
 MIN_EXTENT_M = 1.5  # minimum extent of the plane
 OFFSET_M = 1.0  # distance by which clouds are lowered to find a floor at their origin
+CELL_M, MEAN_CELL_M = 0.25, 0.5  # cell sizes of the subsampling for RANSAC, and of the means for the final fit
 
 
 class Plane(NamedTuple):
@@ -118,10 +119,10 @@ def find_ground_plane(xyz: np.ndarray, below: bool) -> Plane | None:
     is_near = is_candidate & (distance < radius)
     for _ in range(10):
         is_inlier = is_near & (np.abs(compute_height_above_plane(xyz, plane)) <= INLIER_DISTANCE_M)
-        fitted = _fit_cell_means(xyz[is_inlier])
-        if fitted is None:
+        new_plane = _fit_cell_means(xyz[is_inlier])
+        if new_plane is None:
             return None
-        change, plane = np.abs(fitted - plane).max(), fitted
+        change, plane = np.abs(new_plane - plane).max(), new_plane
         if change < 1e-5:
             break
     height = compute_height_above_plane(xyz, plane) if below else -compute_height_above_plane(xyz, plane)
@@ -143,9 +144,9 @@ def _compute_normal(plane: np.ndarray, below: bool) -> np.ndarray:
     return normal if below else -normal
 
 
-def _keep_one_per_cell(xyz: np.ndarray, cell_size: float = 0.25) -> np.ndarray:
+def _keep_one_per_cell(xyz: np.ndarray) -> np.ndarray:
     """Subsample points (N, 3) to one per cell, so that the dense ground near the sensor does not dominate."""
-    _, indices = np.unique(np.floor(xyz / cell_size).astype(np.int64) @ [1 << 40, 1 << 20, 1], return_index=True)
+    _, indices = np.unique(np.floor(xyz / CELL_M).astype(np.int64) @ [1 << 40, 1 << 20, 1], return_index=True)
     return xyz[np.sort(indices)]
 
 
@@ -153,7 +154,7 @@ def _fit_cell_means(xyz: np.ndarray) -> np.ndarray | None:
     """Fit a plane to the mean point of each cell, so that the dense ground near the sensor does not dominate."""
     if len(xyz) < 3:
         return None
-    cells = np.floor(xyz[:, :2] / 0.5).astype(np.int64) @ [1 << 20, 1]
+    cells = np.floor(xyz[:, :2] / MEAN_CELL_M).astype(np.int64) @ [1 << 20, 1]
     _, cell_index, count = np.unique(cells, return_inverse=True, return_counts=True)
     mean = np.column_stack([np.bincount(cell_index, xyz[:, k]) / count for k in range(3)])
     return fit_plane(mean)

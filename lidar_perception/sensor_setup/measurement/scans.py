@@ -18,7 +18,9 @@ from msg_utils.point_cloud2 import to_array
 # Names of the beam number column in the drivers of Velodyne, Ouster, Hesai, Nebula, Livox and RoboSense.
 RING_FIELDS = ("ring", "channel", "line", "laser_id", "laser_number", "row")
 MAX_MEDIAN_RANGE_M = 250.0  # maximum median range of a cloud in metres in the sensor's frame
-MAX_SPREAD_M = 200.0  # maximum median distance to the cloud's centre for a cloud in metres in another frame
+# A distant cloud with a smaller median distance to its own centre is in another frame, such as map. With a
+# larger one, its coordinates are not metres.
+MAX_SPREAD_M = 200.0
 MIN_ELEVATION_SPAN = 1.0  # minimum span of the elevations of a 3D sensor, in degrees
 MIN_POINTS = 100  # minimum number of usable points of a cloud
 

@@ -41,10 +41,10 @@ def measure_timing(scans: Sequence[Scan], stamps_ns: np.ndarray | None) -> Timin
     spans = [float(np.nanmax(s.seconds) - np.nanmin(s.seconds)) for s in scans if s.seconds is not None]
     if stamps_ns is not None and len(stamps_ns) >= MIN_STAMPS:
         steps = np.diff(stamps_ns) * 1e-9
-        forward = steps[steps > 0]
-        period = float(np.median(forward)) if len(forward) else 0.0
+        forward_steps = steps[steps > 0]
+        period = float(np.median(forward_steps)) if len(forward_steps) else 0.0
         if period > 0 and MIN_RATE <= 1 / period <= MAX_RATE:
-            gaps = forward[(forward > MIN_GAP * period) & (forward < MAX_GAP * period)]
+            gaps = forward_steps[(forward_steps > MIN_GAP * period) & (forward_steps < MAX_GAP * period)]
             missing_count = int((np.round(gaps / period) - 1).sum())
             return Timing(1 / period, "stamps", missing_count, int((steps <= 0).sum()))
     if spans and MIN_RATE <= 1 / max(np.median(spans), 1e-9) <= MAX_RATE:

@@ -73,7 +73,7 @@ def format_params(m: SensorMeasurement) -> str:
 def _explain_sensor(m: SensorMeasurement, sensor: Sensor) -> dict[str, str]:
     """Return a comment for each value of sensor.yaml."""
     pattern, mounting, view = m.pattern, m.mounting, m.view
-    unmeasured = "not measured; " + (f"value of {pattern.model}" if pattern.model else "default value")
+    unmeasured_note = "not measured; " + (f"value of {pattern.model}" if pattern.model else "default value")
     height = "not measured: no ground in view" if mounting.height_hint is None else HINT_REASON
     if mounting.mount is not None:
         height = f"+- {mounting.mount.error[0]:.3f}"
@@ -82,12 +82,12 @@ def _explain_sensor(m: SensorMeasurement, sensor: Sensor) -> dict[str, str]:
         "height": height,
         "rate": f"from {m.timing.source}" if np.isfinite(m.timing.rate) else "not measured",
         "azimuth_step": f"{sensor.columns} firings per revolution",
-        "min_range": "nearest return outside the robot's body" if has_min_range else unmeasured,
-        "max_range": "farthest return" if view.max_range >= MIN_OUTDOOR_RANGE_M else unmeasured,
-        "range_noise": unmeasured if np.isnan(pattern.range_noise) else "on smooth surfaces",
-        "divergence": unmeasured,
-        "reach": unmeasured,
-        "silent": "no intensity in the clouds" if m.intensity is None else unmeasured,
+        "min_range": "nearest return outside the robot's body" if has_min_range else unmeasured_note,
+        "max_range": "farthest return" if view.max_range >= MIN_OUTDOOR_RANGE_M else unmeasured_note,
+        "range_noise": unmeasured_note if np.isnan(pattern.range_noise) else "on smooth surfaces",
+        "divergence": unmeasured_note,
+        "reach": unmeasured_note,
+        "silent": "no intensity in the clouds" if m.intensity is None else unmeasured_note,
     }
 
 

@@ -34,11 +34,7 @@ HINT_REASON = "from --height-hint; no ground in view"
 
 
 def choose_params(m: SensorMeasurement) -> Choices:
-    """Choose the parameters of the nodes that depend on the sensor and its mount.
-
-    Raises:
-        InputError: A value is out of the range of its parameter.
-    """
+    """Choose the node parameters that depend on the sensor and its mount. Raise InputError if one is out of range."""
     choices = _choose_intensity(m) | _choose_crop(m)
     mount = m.mounting.mount
     if mount is not None:
@@ -114,9 +110,9 @@ def _choose_ground(m: SensorMeasurement, mount: Mount) -> Choices:
         if plane is not None:
             ground = transform_points(scan.xyz[plane.inliers], mount.pose)
             distances.append(np.percentile(np.hypot(*ground[:, :2].T), 1))
-    nearest = float(np.median(distances))
-    reason = f"the nearest ground is {nearest:.1f} m away"
-    return choices | {"ground.patchwork.min_range": (round(MIN_RANGE_RATIO * nearest, 1), reason)}
+    nearest_distance = float(np.median(distances))
+    reason = f"the nearest ground is {nearest_distance:.1f} m away"
+    return choices | {"ground.patchwork.min_range": (round(MIN_RANGE_RATIO * nearest_distance, 1), reason)}
 
 
 def _choose_ahead(m: SensorMeasurement) -> Choices:
@@ -146,7 +142,7 @@ def _choose_clustering(m: SensorMeasurement) -> Choices:
     default_samples = default["clustering.dbscan.min_samples"]
     min_samples = int(np.clip(round(default_samples * relative_density), MIN_SAMPLES, default_samples))
     density = 1.0 / (elevation_step * azimuth_step)
-    adapted = adapt_to_density(ClusteringParams(density=FULL_DENSITY), density).euclidean
+    adapted_params = adapt_to_density(ClusteringParams(density=FULL_DENSITY), density).euclidean
     return {
         "clustering.dbscan.range_limits": (RANGE_LIMITS_M, "a fourth band, because the resolution is high enough"),
         "clustering.dbscan.eps": (
@@ -165,8 +161,8 @@ def _choose_clustering(m: SensorMeasurement) -> Choices:
             "in sparser clouds they adapt to the density",
         ),
         "clustering.euclidean.min_size": (min_samples, "as for dbscan"),
-        "clustering.euclidean.radius": (round(adapted.radius, 2), "adapted to the density"),
-        "clustering.euclidean.beta": (round(adapted.beta, 2), "adapted to the density"),
+        "clustering.euclidean.radius": (round(adapted_params.radius, 2), "adapted to the density"),
+        "clustering.euclidean.beta": (round(adapted_params.beta, 2), "adapted to the density"),
         "resolution.elevation_step": (round(elevation_step, 3), "median spacing of the beams that hit people"),
         "resolution.azimuth_step": (round(azimuth_step, 3), "between points of a beam"),
     }

@@ -65,8 +65,8 @@ def _describe_view(m: SensorMeasurement) -> Rows:
     is_full_circle = (start, end) == (0.0, 360.0)
     field_of_view = "360 deg" if is_full_circle else f"{(end - start) % 360:.0f} deg, from {start:.0f} to {end:.0f}"
     yield "field of view", field_of_view, LOW if has_few_scans else HIGH
-    hidden = sum((b - a) % 360 or 360 for _, a, b in c.blocked)
-    yield "blind sectors", f"{len(c.blocked)}, {hidden:.0f} deg in total", LOW if has_few_scans else FAIR
+    blind_angle = sum((b - a) % 360 or 360 for _, a, b in c.blocked)
+    yield "blind sectors", f"{len(c.blocked)}, {blind_angle:.0f} deg in total", LOW if has_few_scans else FAIR
     body = "none found"
     if len(c.box):
         low, high = _format_point(c.box[:3]), _format_point(c.box[3:])

@@ -14,7 +14,7 @@ from lidar_perception.simulation.sensor import find_sensor
 
 MAX_SLOPE_SPREAD = 1.0  # maximum variation of the slope of level ground between scans, in degrees
 MAX_HEIGHT_M = 5.0  # maximum plausible height of a sensor
-MAX_TILT = 6.0  # maximum roll or pitch, in degrees, if all clouds are from one place; more may be a slope
+MAX_TILT = 6.0  # maximum roll or pitch in degrees if all clouds are from one place; a larger one may be a slope
 MAX_TILT_DIFFERENCE = 2.0  # tolerance between TF and ground in degrees, in addition to the error, for road camber
 MAX_HEIGHT_DIFFERENCE_M = 0.1  # tolerance between the ground and TF or --height-hint
 MAX_MISSING_FRACTION = 0.01  # maximum fraction of missing clouds
