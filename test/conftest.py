@@ -81,7 +81,7 @@ def data() -> Path:
 
 
 @pytest.fixture
-def carrier_too(monkeypatch):
+def keep_ego_detections(monkeypatch):
     """Keep detections at the ego vehicle, where networks with random weights also find objects."""
     from lidar_perception.detectors import normalized_view
 
@@ -127,7 +127,7 @@ def streets():
 
 
 @pytest.fixture(scope="session")
-def written(tmp_path_factory) -> Path:
+def sample_bag(tmp_path_factory) -> Path:
     """Bag of bag_samples.scans(). Tests must copy it before they change it."""
     from bag_samples import scans
 
@@ -171,9 +171,9 @@ def tiny_sensor(monkeypatch):
 
 
 @pytest.fixture(scope="session")
-def made(streets, tmp_path_factory) -> Path:
+def simulated_data_sets(streets, tmp_path_factory) -> Path:
     """Folder with a simulated data set of five frames in each layout."""
-    from simulate_samples import TINY, run
+    from simulate_samples import TINY, run_simulate
 
     from lidar_perception.simulation.dataset import LAYOUTS
     from lidar_perception.simulation.sensor import SENSORS
@@ -182,35 +182,35 @@ def made(streets, tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(SENSORS, "tiny", TINY)
         for layout in LAYOUTS:
-            assert run(root / layout, layout, 5, 1, "--streets-of", 2).exit_code == 0
+            assert run_simulate(root / layout, layout, 5, 1, "--streets-of", 2).exit_code == 0
     return root
 
 
 @pytest.fixture(scope="session")
-def crowds(tmp_path_factory) -> Path:
+def crowd_recording(tmp_path_factory) -> Path:
     """KITTI folder with crowds of people."""
     from experiment_samples import COUNT
-    from samples import crowd_folder
+    from samples import write_crowd_folder
 
-    return crowd_folder(tmp_path_factory.mktemp("kitti"), COUNT)
+    return write_crowd_folder(tmp_path_factory.mktemp("kitti"), COUNT)
 
 
 @pytest.fixture(scope="session")
-def whole(crowds, tmp_path_factory) -> Path:
+def paper_run(crowd_recording, tmp_path_factory) -> Path:
     """Folder of a complete run of the paper's experiment on `crowds`; its printed output is in ../said."""
-    from experiment_samples import command
-    from samples import write
+    from experiment_samples import run_reproduce
+    from samples import write_file
 
     out = tmp_path_factory.mktemp("whole") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COLUMNS", "160")
-        write(out.parent / "said", command("--data", crowds, "--out", out, "--jobs", 1))
+        write_file(out.parent / "said", run_reproduce("--data", crowd_recording, "--out", out, "--jobs", 1))
     return out
 
 
 @pytest.fixture
-def few(tmp_path) -> Path:
+def five_scans(tmp_path) -> Path:
     """KITTI folder of five scans."""
-    from samples import object_folder
+    from samples import write_object_folder
 
-    return object_folder(tmp_path / "few", count=5)
+    return write_object_folder(tmp_path / "few", count=5)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from samples import object_folder, scene
+from samples import make_scene, write_object_folder
 
 import lidar_perception as lp
 from lidar_perception.clustering.cluster import cluster_obstacles
@@ -62,7 +62,7 @@ def test_type_checking_imports_match_the_objects():
 
 
 def test_ground_and_clusters_equal_those_of_the_core():
-    xyzi = scene(0)
+    xyzi = make_scene(0)
     ground = lp.segment_ground(xyzi[:, :3], "patchwork", sensor_height=1.8, intensity=xyzi[:, 3], max_range=60)
     params = GroundParams("patchwork", SensorPoseParams(1.8), patchwork=PatchworkParams(max_range=60.0))
     np.testing.assert_array_equal(ground, segment_ground(xyzi, params))
@@ -100,7 +100,7 @@ def test_error_names_the_bad_argument_in_one_line(call, words):
 
 
 def test_candidates_include_the_clicked_pedestrian():
-    xyz = scene(1)[:, :3]
+    xyz = make_scene(1)[:, :3]
     automatic = lp.find_candidates(xyz)
     assert set(automatic.class_ids.tolist()) <= {3, 4} or len(automatic) == 0
     ground = lp.segment_ground(xyz)
@@ -127,13 +127,13 @@ def test_evaluate_accepts_own_detector_and_simulated_frames():
 
 
 def test_evaluate_opens_names_and_paths(tmp_path):
-    folder = object_folder(tmp_path / "kitti")
+    folder = write_object_folder(tmp_path / "kitti")
     result = lp.evaluate(f"{__name__}:NearestBox", folder)
     assert result["frames"] == len(lp.open_recording(folder))
 
 
 def test_evaluate_rejects_recording_without_labels(tmp_path):
-    np.save(tmp_path / "cloud.npy", scene(0))
+    np.save(tmp_path / "cloud.npy", make_scene(0))
     with pytest.raises(InputError, match="labelled boxes"):
         lp.evaluate(NearestBox(), tmp_path / "cloud.npy")
 
@@ -155,6 +155,6 @@ def test_tracker_keeps_ids_of_moving_detections():
 
 def test_loaded_detector_returns_detections():
     detector = lp.load_detector(f"{__name__}:NearestBox", min_score=0.4)
-    found = detector(scene(0))
+    found = detector(make_scene(0))
     assert isinstance(found, DetectionResult) and len(found.detections) == 1
-    assert len(lp.load_detector(f"{__name__}:NearestBox", min_score=0.6)(scene(0)).detections) == 0
+    assert len(lp.load_detector(f"{__name__}:NearestBox", min_score=0.6)(make_scene(0)).detections) == 0

@@ -338,7 +338,7 @@ STRICT = tuple(
 def test_core_functions_without_numba_have_types(name):
     """mypy would also require types in functions for Numba, which ignores them (setup.cfg)."""
 
-    def typed(node):
+    def has_types(node):
         named = [
             *node.args.posonlyargs,
             *node.args.args,
@@ -354,7 +354,7 @@ def test_core_functions_without_numba_have_types(name):
         for node in ast.walk(parse_source(name))
         if isinstance(node, ast.FunctionDef)
         and not any("njit" in ast.unparse(d) for d in node.decorator_list)
-        and not typed(node)
+        and not has_types(node)
     ] == []
 
 

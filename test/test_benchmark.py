@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
-from samples import object_folder, scene, walker_label
+from samples import make_scene, make_walker_label, write_object_folder
 
 from benchmark import ground, peers, plain_euclidean, startup
 from benchmark.clustering import have_same_clusters, measure_dbscan, measure_dbscans
@@ -96,7 +96,7 @@ def test_missed_target_is_marked(unit, target, good, bad, text):
 
 
 def test_missing_peers_are_reported(nothing_installed, capsys):
-    xyz, frame = cloud(), PointCloud(scene()[:, :3], scene()[:, 3])
+    xyz, frame = cloud(), PointCloud(make_scene()[:, :3], make_scene()[:, 3])
     for content in (
         measure_dbscan("DBSCAN", [xyz], 1, 12.0),
         ground.measure_patchwork([frame], 1),
@@ -109,7 +109,7 @@ def test_missing_peers_are_reported(nothing_installed, capsys):
 
 
 def test_ground_is_scored_without_the_peer_libraries(nothing_installed, capsys):
-    points = scene()
+    points = make_scene()
     semantic = np.where(points[:, 2] < -1.6, 40, 30).astype(np.uint16)
     scan = Frame.of(
         "a", PointCloud(points[:, :3], points[:, 3]), point_truth=lambda: PointTruth(semantic, np.zeros_like(semantic))
@@ -121,7 +121,7 @@ def test_ground_is_scored_without_the_peer_libraries(nothing_installed, capsys):
 
 
 def test_every_version_is_timed_step_by_step_on_random_weights(one_thread, capsys, monkeypatch):
-    points, ran, experts = scene(), {}, pointpillars.run_experts
+    points, ran, experts = make_scene(), {}, pointpillars.run_experts
 
     def seen(frame, config, *given):
         made = experts(frame, config, *given)
@@ -144,7 +144,7 @@ def test_every_version_is_timed_step_by_step_on_random_weights(one_thread, capsy
 
 
 def test_engines_are_timed_and_compared(one_thread, capsys):
-    points = scene()
+    points = make_scene()
     content = measure_engines([PointCloud(points[:, :3], points[:, 3])], 1, ("pointpillars",))
     print_measured(json.loads(json.dumps(content)))
     assert "around, engine torch" in " ".join(capsys.readouterr().out.split())
@@ -163,7 +163,7 @@ def test_startup_is_measured_with_and_without_torch(monkeypatch, capsys):
 
 
 def test_pointnet_is_timed_against_a_plain_network(one_thread, capsys):
-    points = scene()
+    points = make_scene()
     content = measure_pointnet([PointCloud(points[:, :3], points[:, 3])] * 2, 1)
     print_pointnet(json.loads(json.dumps(content)))
     shown = capsys.readouterr().out
@@ -190,7 +190,7 @@ def test_command_writes_the_measurements(nothing_installed, monkeypatch, tmp_pat
             "rows": [],
         },
     )
-    root, out = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "b.json"
+    root, out = write_object_folder(tmp_path / "kitti", make_walker_label(), 1), tmp_path / "b.json"
     done = CliRunner().invoke(
         benchmark.main,
         ["--data", str(root), "--json", str(out), "--repeat", "1", "--frames", "1", "--no-graph"],

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from samples import object_folder, scene
+from samples import make_scene, write_object_folder
 
 import lidar_perception as lp
 
@@ -19,14 +19,14 @@ NOTEBOOK = EXAMPLES / "first_steps.ipynb"
 SENSOR = "generic:16,-20,5,1,10"
 
 
-def code_of(notebook: Path) -> list[str]:
+def get_code(notebook: Path) -> list[str]:
     """Return the source of each code cell."""
     cells = json.loads(notebook.read_text())["cells"]
     return ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
 
 
 def test_examples_are_short_and_use_the_public_interface():
-    sources = [path.read_text() for path in SCRIPTS] + ["\n".join(code_of(NOTEBOOK))]
+    sources = [path.read_text() for path in SCRIPTS] + ["\n".join(get_code(NOTEBOOK))]
     assert len(SCRIPTS) == 6
     for source in sources:
         assert "import lidar_perception as lp" in source and "lidar_perception." not in source
@@ -39,12 +39,12 @@ def run(tmp_path, monkeypatch, capsys):
     returns its output."""
     simulate = lp.simulate
 
-    def small(frames=40, *args, **options):
+    def simulate_briefly(frames=40, *args, **options):
         return simulate(min(frames, 2), *args, **{**options, "sensor": SENSOR})
 
     def run_script(name: str, *arguments: object) -> str:
         monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(lp, "simulate", small, raising=False)
+        monkeypatch.setattr(lp, "simulate", simulate_briefly, raising=False)
         monkeypatch.setattr("sys.argv", [name, *map(str, arguments)])
         runpy.run_path(str(EXAMPLES / name), run_name="__main__")
         return capsys.readouterr().out
@@ -67,9 +67,9 @@ def test_example_runs_on_simulated_scans(run, name, words):
 
 
 def test_example_accepts_a_recording(run, tmp_path):
-    np.save(tmp_path / "cloud.npy", scene(0))
+    np.save(tmp_path / "cloud.npy", make_scene(0))
     assert "patchwork: " in run("ground_and_clusters.py", tmp_path / "cloud.npy")
-    output = run("evaluate.py", object_folder(tmp_path / "kitti"), "pointnet")
+    output = run("evaluate.py", write_object_folder(tmp_path / "kitti"), "pointnet")
     assert "pointnet on 2 frames" in output and "Pedestrian" in output
 
 
@@ -85,7 +85,7 @@ def test_notebook_runs(monkeypatch):
 
     plt.switch_backend("Agg")
     names: dict = {}
-    for cell in code_of(NOTEBOOK):
+    for cell in get_code(NOTEBOOK):
         exec(compile(cell, str(NOTEBOOK), "exec"), names)
     plt.close("all")
     assert len(names["found"]) > 0 and names["cluster_ids"].max() > 0

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from samples import object_folder, scene
+from samples import make_scene, write_object_folder
 
 pytestmark = pytest.mark.no_cover  # covered by other tests
 
@@ -29,7 +29,7 @@ def find_parts(name: str) -> list[tuple[str, str, str]]:
 
 
 @pytest.fixture
-def copy(tmp_path) -> Path:
+def package_copy(tmp_path) -> Path:
     """Copy the package as hard links, so that no weights are copied and Numba's cache is valid."""
     for package in ("lidar_perception", "msg_utils"):
         shutil.copytree(
@@ -68,7 +68,7 @@ def apply_example(copy: Path, name: str) -> list[str]:
     return [path for path, _, _ in find_parts(name)]
 
 
-def run(copy: Path, *arguments, folder: Path | None = None) -> str:
+def run_copy(copy: Path, *arguments, folder: Path | None = None) -> str:
     """Run a command with the package at `copy` and return its output."""
     environment = {**os.environ, "PYTHONPATH": str(copy), "COLUMNS": "200"}
     done = subprocess.run(
@@ -87,31 +87,31 @@ def test_example_changes_the_stated_number_of_files(name, files):
     assert len(find_parts(name)) == files
 
 
-def test_data_format_needs_one_file_and_one_entry(copy, tmp_path):
-    apply_example(copy, "npy")
+def test_data_format_needs_one_file_and_one_entry(package_copy, tmp_path):
+    apply_example(package_copy, "npy")
     (tmp_path / "clouds").mkdir()
     for i in range(2):
-        np.save(tmp_path / "clouds" / f"{i}.npy", scene(i))
+        np.save(tmp_path / "clouds" / f"{i}.npy", make_scene(i))
     np.save(tmp_path / "clouds" / "0.boxes.npy", [[8, 0.5, -0.85, 0.5, 0.5, 1.7, 0.3]])
-    output = run(copy, "convert", tmp_path / "clouds", "--out", tmp_path / "bag")
+    output = run_copy(package_copy, "convert", tmp_path / "clouds", "--out", tmp_path / "bag")
     assert "folder of .npy clouds, 2 frames" in output and "2 scans of 2" in output
 
 
 def test_detector_is_a_class_in_your_own_file(tmp_path):
     (source,) = re.findall(r"`my_detector.py`:\n\n```python\n(.*?)```", PAGE, re.S)
     (tmp_path / "my_detector.py").write_text(source)
-    output = run(
+    output = run_copy(
         ROOT,
         "evaluate",
         "detection",
         "--data",
-        object_folder(tmp_path / "kitti"),
+        write_object_folder(tmp_path / "kitti"),
         "--weights",
         "my_detector:TallClusters",
         folder=tmp_path,
     )
     assert "2 frames" in output and "Ped" in output
-    run(
+    run_copy(
         ROOT,
         "detect",
         tmp_path / "kitti",
@@ -124,20 +124,22 @@ def test_detector_is_a_class_in_your_own_file(tmp_path):
     assert "Pedestrian" in (tmp_path / "results" / "detections.json").read_text()
 
 
-def test_detector_needs_one_folder_and_one_entry(copy, tmp_path):
-    apply_example(copy, "sizes")
-    output = run(copy, "evaluate", "detection", "--data", object_folder(tmp_path / "kitti"), "--weights", "sizes")
+def test_detector_needs_one_folder_and_one_entry(package_copy, tmp_path):
+    apply_example(package_copy, "sizes")
+    output = run_copy(
+        package_copy, "evaluate", "detection", "--data", write_object_folder(tmp_path / "kitti"), "--weights", "sizes"
+    )
     assert "2 frames" in output
 
 
-def test_ground_method_needs_one_file_and_two_entries(copy, tmp_path):
-    apply_example(copy, "lowest")
-    output = run(
-        copy,
+def test_ground_method_needs_one_file_and_two_entries(package_copy, tmp_path):
+    apply_example(package_copy, "lowest")
+    output = run_copy(
+        package_copy,
         "evaluate",
         "segmentation",
         "--data",
-        object_folder(tmp_path / "kitti"),
+        write_object_folder(tmp_path / "kitti"),
         "--methods",
         "dbscan",
         "--set",
@@ -146,13 +148,13 @@ def test_ground_method_needs_one_file_and_two_entries(copy, tmp_path):
     assert "ground by lowest" in output
 
 
-def test_class_needs_one_row_and_shipped_networks_still_work(copy, tmp_path):
-    file = copy / "lidar_perception" / "classes.py"
+def test_class_needs_one_row_and_shipped_networks_still_work(package_copy, tmp_path):
+    file = package_copy / "lidar_perception" / "classes.py"
     known, row = file.read_text(), '    ObjectClass("Truck", vehicle=True),\n'
     assert row in known
     file.unlink()  # a hard link to the original
     numbers = "DetectionConstants((8.0, 2.5, 3.2), 0.6, 0.45, (8.0, 2.5, 3.2), 5.0, 0.7, 0.5)"
     file.write_text(known.replace(row, row.replace("vehicle", f"{numbers}, vehicle")))
-    output = run(copy, "evaluate", "detection", "--data", object_folder(tmp_path / "kitti"))
+    output = run_copy(package_copy, "evaluate", "detection", "--data", write_object_folder(tmp_path / "kitti"))
     assert "2 frames" in output and "Truck" in output
     assert re.search(r"\n +Car E +Car M +Car H +Cyc E", output)  # the paper's columns

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import each_make, header
+from samples import each_make, make_any_header
 
 from lidar_perception.clustering.shapes import fit_boxes, fit_ellipses
 from lidar_perception.groups import count_clusters, group_by_id, group_points, renumber_ids
@@ -19,7 +19,7 @@ from msg_utils.point_cloud2 import from_array
 ids = st.lists(st.sampled_from([-(2**31), -1, 0, 1, 2, 3, 7, 2**31, 2**32 - 1]), max_size=30)
 
 
-def plain(values):
+def number_ids_slowly(values):
     """Return labels and counts of a plain implementation."""
     numbers = sorted({int(v) for v in values if np.isfinite(v) and v > 0})
     return [numbers.index(v) + 1 if v in numbers else 0 for v in values], numbers
@@ -28,7 +28,7 @@ def plain(values):
 @given(ids, st.sampled_from(["i8", "f8"]))
 def test_clusters_are_renumbered_without_gaps(values, kind):
     labels, numbers = renumber_ids(np.array(values, kind))
-    assert (labels.tolist(), numbers.tolist()) == plain(values)
+    assert (labels.tolist(), numbers.tolist()) == number_ids_slowly(values)
     assert (labels.dtype, numbers.dtype) == (np.int32, np.int64)
 
 
@@ -86,10 +86,10 @@ def test_memory_depends_on_the_points_not_on_the_ids():
 def test_cluster_column_reads_the_given_rows(make):
     cloud = np.zeros(5, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("cluster_id", "<u4")])
     cloud["cluster_id"] = [9, 4_000_000_000, 0, 9, 2]
-    msg = from_array(cloud, header(make), make)
+    msg = from_array(cloud, make_any_header(make), make)
     labels, numbers = read_cluster_ids(msg, np.array([1, 2, 3]))
     assert labels.tolist() == [2, 0, 1] and numbers.tolist() == [9, 4_000_000_000]
-    without_ids = from_array(cloud[["x"]].copy(), header(make), make)
+    without_ids = from_array(cloud[["x"]].copy(), make_any_header(make), make)
     assert read_cluster_ids(without_ids, np.arange(5)) is None
 
 

@@ -77,21 +77,21 @@ each_field = for_all(FIELDS)
 each_params = for_all([*GROUPS, *COMPOSITES])
 
 
-def kind_of(f: dataclasses.Field) -> type:
+def get_type(f: dataclasses.Field) -> type:
     return f.metadata["item"] or type(f.default)
 
 
-def as_field(f: dataclasses.Field, value):
+def to_field_value(f: dataclasses.Field, value):
     """Return the value for a scalar field, or a list as long as the default that starts with it."""
     return (value, *f.default[1:]) if f.metadata["item"] else value
 
 
-def bounded(limit: str) -> list:
+def list_bounded_fields(limit: str) -> list:
     return [p for p in FIELDS if p.values[1].metadata[limit] is not None]
 
 
-def step_of(f: dataclasses.Field) -> float:
-    return 1 if kind_of(f) is int else 0.5
+def get_step(f: dataclasses.Field) -> float:
+    return 1 if get_type(f) is int else 0.5
 
 
 def other_value(f: dataclasses.Field):
@@ -101,7 +101,7 @@ def other_value(f: dataclasses.Field):
     if f.name in ("body", "sectors"):  # lists of six numbers or of pairs; empty by default
         return (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
     if f.metadata["item"]:
-        return (*f.default, "/more") if kind_of(f) is str else tuple(v + 1.0 for v in f.default)
+        return (*f.default, "/more") if get_type(f) is str else tuple(v + 1.0 for v in f.default)
     if isinstance(f.default, bool):
         return not f.default
     if isinstance(f.default, str):
@@ -135,7 +135,7 @@ def test_defaults_are_valid(kind):
 @each_field
 def test_each_field_is_documented(group, f):
     assert f.metadata["doc"].endswith(".")
-    assert kind_of(f) in (bool, int, float, str)
+    assert get_type(f) in (bool, int, float, str)
     assert f.metadata["choices"] == () or f.default in f.metadata["choices"]
 
 
@@ -155,39 +155,39 @@ def test_with_values_keeps_other_values(kind):
         assert flatten(with_values(kind(), {name: other_value(f)})) == {**flatten(kind()), name: other_value(f)}
 
 
-@for_all(bounded("low"))
+@for_all(list_bounded_fields("low"))
 def test_error_below_the_range_names_field_and_range(group, f):
-    value = f.metadata["low"] - step_of(f)
+    value = f.metadata["low"] - get_step(f)
     with pytest.raises(ValueError) as error:
-        group(**{f.name: as_field(f, value)})
+        group(**{f.name: to_field_value(f, value)})
     for word in (f.name, str(value), f"{f.metadata['low']} .. "):
         assert word in str(error.value)
 
 
-@for_all(bounded("high"))
+@for_all(list_bounded_fields("high"))
 def test_error_above_the_range_names_field_and_range(group, f):
-    value = f.metadata["high"] + step_of(f)
+    value = f.metadata["high"] + get_step(f)
     with pytest.raises(ValueError) as error:
-        group(**{f.name: as_field(f, value)})
+        group(**{f.name: to_field_value(f, value)})
     for word in (f.name, str(value), f" .. {f.metadata['high']}"):
         assert word in str(error.value)
 
 
-@for_all([p for p in bounded("low") + bounded("high") if not p.values[1].metadata["item"]])
+@for_all([p for p in list_bounded_fields("low") + list_bounded_fields("high") if not p.values[1].metadata["item"]])
 def test_range_includes_its_limits(group, f):
     for limit in (f.metadata["low"], f.metadata["high"]):
         if limit is not None:
-            assert getattr(group(**{f.name: kind_of(f)(limit)}), f.name) == limit
+            assert getattr(group(**{f.name: get_type(f)(limit)}), f.name) == limit
 
 
 @each_field
 def test_error_of_a_wrong_type_names_field_and_type(group, f):
-    wrong = {bool: [1, 0.0, "true"], int: [1.0, "1", True], float: ["1.0", True, 1j], str: [1, 2.0, True]}[kind_of(f)]
+    wrong = {bool: [1, 0.0, "true"], int: [1.0, "1", True], float: ["1.0", True, 1j], str: [1, 2.0, True]}[get_type(f)]
     for value in [None, *wrong]:
         with pytest.raises(ValueError, match=f"^{f.name} = ") as error:
-            group(**{f.name: as_field(f, value)})
+            group(**{f.name: to_field_value(f, value)})
         assert repr(value) in str(error.value)
-        assert kind_of(f).__name__ in str(error.value)
+        assert get_type(f).__name__ in str(error.value)
 
 
 @for_all([p for p in FIELDS if p.values[1].metadata["item"]])
@@ -197,10 +197,10 @@ def test_scalar_for_a_list_is_rejected(group, f):
             group(**{f.name: value})
 
 
-@for_all([p for p in FIELDS if kind_of(p.values[1]) is float])
+@for_all([p for p in FIELDS if get_type(p.values[1]) is float])
 def test_nan_is_rejected(group, f):
     with pytest.raises(ValueError, match=f"^{f.name} is not a number"):
-        group(**{f.name: as_field(f, math.nan)})
+        group(**{f.name: to_field_value(f, math.nan)})
 
 
 @for_all([p for p in FIELDS if p.values[1].metadata["choices"]])

@@ -13,7 +13,7 @@ seeds = st.integers(0, 2**32 - 1)
 QUARTER = np.pi / 2
 
 
-def some_boxes(rng, count, reach=3.0):
+def draw_boxes(rng, count, reach=3.0):
     """Make boxes close to each other, some of which touch or are rotated by quarter turns."""
     boxes = np.column_stack(
         [
@@ -30,7 +30,7 @@ def some_boxes(rng, count, reach=3.0):
     return boxes
 
 
-def moved(boxes, shift, yaw):
+def move_boxes(boxes, shift, yaw):
     cos, sin = np.cos(yaw), np.sin(yaw)
     x, y = boxes[:, 0], boxes[:, 1]
     return np.column_stack(
@@ -44,7 +44,7 @@ def moved(boxes, shift, yaw):
     )
 
 
-def by_shapely(boxes, others):
+def compute_by_shapely(boxes, others):
     shapely = pytest.importorskip("shapely", reason="needs shapely, of the extra [test]")
     a, b = (shapely.polygons(box_corners(x)[:, :4, :2]) for x in (boxes, others))
     # Use a fine grid, because GEOS sometimes misses the overlap of almost coincident edges.
@@ -60,28 +60,28 @@ def by_shapely(boxes, others):
 @given(seeds)
 def test_overlaps_equal_shapely(seed):
     rng = np.random.default_rng(seed)
-    boxes, others = some_boxes(rng, 12), some_boxes(rng, 12)
+    boxes, others = draw_boxes(rng, 12), draw_boxes(rng, 12)
     others[:4] = boxes[:4]  # identical
     others[4] = boxes[4] + [0, 0, 0, 0, 0, 0, QUARTER]
     others[5] = boxes[5] * [1, 1, 1, 0.4, 0.4, 0.4, 1]  # contained
-    others[6:8] = moved(boxes[6:8] * [0, 0, 0, 1, 1, 1, 0], (boxes[6, 3], 0, 0), 0)  # touching
-    for found, expected in zip(bev_and_3d_iou(boxes, others), by_shapely(boxes, others)):
+    others[6:8] = move_boxes(boxes[6:8] * [0, 0, 0, 1, 1, 1, 0], (boxes[6, 3], 0, 0), 0)  # touching
+    for found, expected in zip(bev_and_3d_iou(boxes, others), compute_by_shapely(boxes, others)):
         np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 @given(seeds, st.floats(-7, 7), st.floats(-80, 80), st.floats(-80, 80))
 def test_overlap_does_not_depend_on_the_frame(seed, yaw, x, y):
     rng = np.random.default_rng(seed)
-    boxes, others = some_boxes(rng, 8), some_boxes(rng, 5)
+    boxes, others = draw_boxes(rng, 8), draw_boxes(rng, 5)
     before = bev_and_3d_iou(boxes, others)
-    after = bev_and_3d_iou(moved(boxes, (x, y, 3), yaw), moved(others, (x, y, 3), yaw))
+    after = bev_and_3d_iou(move_boxes(boxes, (x, y, 3), yaw), move_boxes(others, (x, y, 3), yaw))
     np.testing.assert_allclose(after, before, atol=1e-9)
 
 
 @given(seeds)
 def test_overlap_is_symmetric_and_between_0_and_1(seed):
     rng = np.random.default_rng(seed)
-    boxes, others = some_boxes(rng, 8), some_boxes(rng, 5)
+    boxes, others = draw_boxes(rng, 8), draw_boxes(rng, 5)
     for there, back in zip(bev_and_3d_iou(boxes, others), bev_and_3d_iou(others, boxes)):
         np.testing.assert_allclose(there, back.T, atol=1e-9)
         assert (there >= 0).all() and (there <= 1).all()
@@ -93,7 +93,7 @@ def test_overlap_is_symmetric_and_between_0_and_1(seed):
 @given(seeds)
 def test_equivalent_boxes_have_equal_overlaps(seed):
     rng = np.random.default_rng(seed)
-    boxes, others = some_boxes(rng, 8), some_boxes(rng, 5)
+    boxes, others = draw_boxes(rng, 8), draw_boxes(rng, 5)
     before = bev_and_3d_iou(boxes, others)
     swapped = boxes[:, [0, 1, 2, 4, 3, 5, 6]] + [0, 0, 0, 0, 0, 0, QUARTER]
     for same in (boxes + [0, 0, 0, 0, 0, 0, np.pi], swapped):
@@ -131,7 +131,7 @@ def test_overlaps_equal_hand_computed_values(name, box, other, bev, space):
 
 
 def test_any_shape_dtype_and_layout_is_accepted():
-    boxes = some_boxes(np.random.default_rng(0), 6)
+    boxes = draw_boxes(np.random.default_rng(0), 6)
     for rows, columns in ((0, 6), (6, 0), (0, 0), (2, 6)):
         for matrix in bev_and_3d_iou(boxes[:rows], boxes[:columns]):
             assert matrix.shape == (rows, columns) and matrix.dtype == np.float64

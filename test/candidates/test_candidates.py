@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from candidate_samples import GROUND_Z, PEOPLE, boxes_at, person, scene
+from candidate_samples import GROUND_Z, PEOPLE, make_boxes_at, make_people_scene, make_person
 from hypothesis import given
 from hypothesis import strategies as st
 from samples import DATA, needs_data
@@ -77,8 +77,8 @@ def make_params(threshold):
 
 
 def test_stages_are_subsets_of_the_first_stage():
-    segmented = segment_cloud(PointCloud(scene()))
-    (seed,) = make_truth_source(boxes_at(PEOPLE))(segmented)
+    segmented = segment_cloud(PointCloud(make_people_scene()))
+    (seed,) = make_truth_source(make_boxes_at(PEOPLE))(segmented)
     has_seed_height = select_by_height(segmented.boxes, seed.height, HeightParams())
     assert 3 < has_seed_height.sum() < len(segmented.boxes)
     for threshold in (0.0, 0.4, 0.7, 0.9, 1.0):
@@ -92,7 +92,7 @@ def test_stages_are_subsets_of_the_first_stage():
 
 
 def test_threshold_0_accepts_all_clusters_and_1_only_the_seed():
-    segmented = segment_cloud(PointCloud(scene()))
+    segmented = segment_cloud(PointCloud(make_people_scene()))
     k = segmented.cluster_ids[np.argmin(np.linalg.norm(segmented.xyz - [7, 2, -1], axis=1))]
     seed = seed_from_points(segmented.xyz[segmented.cluster_ids == k], segmented.boxes[k - 1])
     unfiltered = refine_segmented(segmented, make_fixed_source(seed), make_params(0.0))
@@ -104,8 +104,8 @@ def test_threshold_0_accepts_all_clusters_and_1_only_the_seed():
 
 
 def test_augmentation_changes_scores_from_15_to_30_metres_only():
-    segmented = segment_cloud(PointCloud(scene()))
-    candidates = refine_segmented(segmented, make_truth_source(boxes_at(PEOPLE)), make_params(0.0))
+    segmented = segment_cloud(PointCloud(make_people_scene()))
+    candidates = refine_segmented(segmented, make_truth_source(make_boxes_at(PEOPLE)), make_params(0.0))
     np.testing.assert_array_equal(candidates.final.boxes, candidates.stage1.boxes)
     ranges = np.hypot(*candidates.final.boxes[:, :2].T)
     differs = candidates.final.scores != candidates.stage1.scores
@@ -113,8 +113,8 @@ def test_augmentation_changes_scores_from_15_to_30_metres_only():
 
 
 def test_threshold_applies_to_the_scores_of_each_stage():
-    segmented = segment_cloud(PointCloud(scene()))
-    seed = make_fixed_source(*make_truth_source(boxes_at(PEOPLE))(segmented))
+    segmented = segment_cloud(PointCloud(make_people_scene()))
+    seed = make_fixed_source(*make_truth_source(make_boxes_at(PEOPLE))(segmented))
     unfiltered = refine_segmented(segmented, seed, make_params(0.0))
     assert (unfiltered.final.scores != unfiltered.stage2.scores).any()
     scores = np.unique(np.concatenate([unfiltered.stage2.scores, unfiltered.final.scores]))
@@ -127,7 +127,9 @@ def test_threshold_applies_to_the_scores_of_each_stage():
 
 
 def test_pedestrians_are_candidates_and_other_objects_are_not():
-    _, candidates = find_candidates(PointCloud(scene()), make_truth_source(boxes_at(PEOPLE)), params=make_params(0.75))
+    _, candidates = find_candidates(
+        PointCloud(make_people_scene()), make_truth_source(make_boxes_at(PEOPLE)), params=make_params(0.75)
+    )
     order = np.argsort(candidates.final.boxes[:, 0])
     np.testing.assert_allclose(candidates.final.boxes[order, :2], PEOPLE + [0.05, 0], atol=0.1)
     bottoms = candidates.final.boxes[:, 2] - candidates.final.boxes[:, 5] / 2
@@ -135,7 +137,7 @@ def test_pedestrians_are_candidates_and_other_objects_are_not():
 
 
 def test_refining_without_clusters_finds_no_candidates():
-    seed = Seed(person(7, 2).astype(np.float32), -1.7, 1.7)
+    seed = Seed(make_person(7, 2).astype(np.float32), -1.7, 1.7)
     xyz = np.ones((5, 3), np.float32)
     candidates = refine_clusters(xyz, np.zeros(5, np.int32), np.zeros((0, 7), np.float32), [seed])
     for stage in (candidates.stage1, candidates.stage2, candidates.final):
@@ -165,7 +167,7 @@ def test_seed_cluster_passes_every_stage():
 
 def test_candidates_keep_the_ids_of_given_clusters():
     """Ids may have gaps and be huge; the candidates are the same as for 1..K."""
-    frame = PointCloud(scene())
+    frame = PointCloud(make_people_scene())
     segmented = segment_cloud(frame)
     cluster_count = len(segmented.boxes)
     source = make_fixed_source(seed_from_points(segmented.xyz[segmented.cluster_ids == 1], segmented.boxes[0]))
@@ -186,7 +188,7 @@ def test_candidates_keep_the_ids_of_given_clusters():
     ],
 )
 def test_seed_bank_gives_each_cluster_its_best_score(params):
-    segmented = segment_cloud(PointCloud(scene()), params=params)
+    segmented = segment_cloud(PointCloud(make_people_scene()), params=params)
     sizes = np.bincount(segmented.cluster_ids)[1:]
     seeds = [
         seed_from_points(segmented.xyz[segmented.cluster_ids == k + 1], segmented.boxes[k])

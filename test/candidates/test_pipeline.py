@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from candidate_samples import boxes_at, floor, person, scene
+from candidate_samples import make_boxes_at, make_floor, make_people_scene, make_person
 
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.params import STEPS, PipelineParams
@@ -17,12 +17,12 @@ from lidar_perception.wire.params import ViewParams
 
 
 def make_template_source():
-    return make_fixed_source(seed_from_points(person(7, 2).astype(np.float32), boxes_at([[7, 2]])[0]))
+    return make_fixed_source(seed_from_points(make_person(7, 2).astype(np.float32), make_boxes_at([[7, 2]])[0]))
 
 
 @pytest.mark.parametrize(
     "xyz",
-    [np.zeros((0, 3)), np.float32([[5, 0, -1]]), np.float32([[5, 0, -1.7]]), floor()],
+    [np.zeros((0, 3)), np.float32([[5, 0, -1]]), np.float32([[5, 0, -1.7]]), make_floor()],
     ids=["empty", "one point", "one low point", "only ground"],
 )
 def test_clouds_without_objects_give_empty_results(xyz):
@@ -40,9 +40,9 @@ def test_clouds_without_objects_give_empty_results(xyz):
 
 def test_cloud_without_a_seed_raises_input_error():
     with pytest.raises(InputError, match="no Pedestrian"):
-        find_candidates(PointCloud(scene()), make_truth_source(np.zeros((0, 7))))
+        find_candidates(PointCloud(make_people_scene()), make_truth_source(np.zeros((0, 7))))
     with pytest.raises(InputError, match="no clusters"):
-        find_candidates(PointCloud(floor().astype(np.float32)), make_click_source(np.zeros(3)))
+        find_candidates(PointCloud(make_floor().astype(np.float32)), make_click_source(np.zeros(3)))
 
 
 WITH_VIEW = PipelineParams(view=ViewParams(enabled=True))
@@ -50,7 +50,7 @@ WITH_VIEW = PipelineParams(view=ViewParams(enabled=True))
 
 def test_error_for_missing_camera_names_the_remedy():
     with pytest.raises(InputError, match=r"view\.enabled"):
-        find_candidates(PointCloud(scene()), make_template_source(), params=WITH_VIEW)
+        find_candidates(PointCloud(make_people_scene()), make_template_source(), params=WITH_VIEW)
 
 
 def test_restricted_view_equals_pipeline_on_cropped_points():
@@ -58,7 +58,7 @@ def test_restricted_view_equals_pipeline_on_cropped_points():
     axes = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
     intrinsics = np.array([[600, 0, 500], [0, 600, 300], [0, 0, 1]])
     camera = Camera(np.column_stack([intrinsics @ axes, np.zeros(3)]), 1000, 600)
-    xyz = scene()
+    xyz = make_people_scene()
     in_view = camera.in_view(xyz)
     assert 0 < in_view.sum() < len(xyz)
     segmented, candidates = find_candidates(PointCloud(xyz), make_template_source(), camera, WITH_VIEW)
@@ -73,7 +73,7 @@ def test_restricted_view_equals_pipeline_on_cropped_points():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_order_of_the_points_does_not_matter(seed):
-    xyz = scene()
+    xyz = make_people_scene()
     order = np.random.default_rng(seed).permutation(len(xyz))
     segmented, candidates = find_candidates(PointCloud(xyz), make_template_source())
     shuffled_segmented, shuffled_candidates = find_candidates(PointCloud(xyz[order]), make_template_source())
@@ -88,6 +88,6 @@ def test_order_of_the_points_does_not_matter(seed):
 
 
 def test_ground_points_have_no_cluster_and_ids_match_boxes():
-    segmented = segment_cloud(PointCloud(scene()))
+    segmented = segment_cloud(PointCloud(make_people_scene()))
     assert not (segmented.ground & (segmented.cluster_ids > 0)).any()
     assert np.unique(segmented.cluster_ids).tolist() == list(range(len(segmented.boxes) + 1))

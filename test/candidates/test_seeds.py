@@ -7,7 +7,7 @@ import os
 
 import numpy as np
 import pytest
-from candidate_samples import GROUND_Z, PEOPLE, boxes_at, person, scene
+from candidate_samples import GROUND_Z, PEOPLE, make_boxes_at, make_people_scene, make_person
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -28,9 +28,9 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def test_seed_from_labels_is_the_nearest_pedestrian():
-    xyz = scene()
+    xyz = make_people_scene()
     ground = xyz[:, 2] < GROUND_Z + 0.4  # includes the feet
-    boxes = boxes_at(PEOPLE[[2, 0, 1]])
+    boxes = make_boxes_at(PEOPLE[[2, 0, 1]])
     in_box = points_in_box(xyz, boxes[1])
     assert (in_box & ground).any()
     seed = seed_from_truth(xyz, ground, boxes)
@@ -41,20 +41,20 @@ def test_seed_from_labels_is_the_nearest_pedestrian():
 
 
 def test_seed_from_labels_needs_a_pedestrian_with_ten_points():
-    xyz = person(6, 0, count=9).astype(np.float32)
+    xyz = make_person(6, 0, count=9).astype(np.float32)
     no_ground = np.zeros(9, bool)
     with pytest.raises(InputError, match="no Pedestrian"):
         seed_from_truth(xyz, no_ground, np.zeros((0, 7)))
     with pytest.raises(InputError, match="has only 9 points"):
-        seed_from_truth(xyz, no_ground, boxes_at([[6, 0]]))
+        seed_from_truth(xyz, no_ground, make_boxes_at([[6, 0]]))
     ten_points = np.concatenate([xyz, xyz[:1]])
-    assert seed_from_truth(ten_points, np.zeros(10, bool), boxes_at([[6, 0]])).height == 1.8
+    assert seed_from_truth(ten_points, np.zeros(10, bool), make_boxes_at([[6, 0]])).height == 1.8
     with pytest.raises(InputError, match="has only 0 points"):
-        seed_from_truth(ten_points, np.ones(10, bool), boxes_at([[6, 0]]))
+        seed_from_truth(ten_points, np.ones(10, bool), make_boxes_at([[6, 0]]))
 
 
 def make_clicked_scene():
-    xyz = np.concatenate([person(6, 0), person(8, 3, seed=1)]).astype(np.float32)
+    xyz = np.concatenate([make_person(6, 0), make_person(8, 3, seed=1)]).astype(np.float32)
     labels = np.repeat(np.int32([1, 2]), 400)
     return xyz, labels, fit_boxes(xyz, labels, "axis_aligned")
 

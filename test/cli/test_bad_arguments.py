@@ -6,8 +6,8 @@ import subprocess
 import sys
 
 import pytest
-from cli_samples import error_line, exit_of
-from samples import object_folder, write
+from cli_samples import read_error_line, run_main
+from samples import write_file, write_object_folder
 
 from lidar_perception.data.bag import BagWriter
 from lidar_perception.types import find_closest_name
@@ -46,7 +46,7 @@ from lidar_perception.wire.topics import POINTS
 )
 def test_invalid_command_creates_no_files(words, kitti, tmp_path, monkeypatch, capsys):
     option = "--write-results" if words.startswith("evaluate") else "--out"
-    assert exit_of(monkeypatch, *words.format(kitti=kitti).split(), option, tmp_path / "not/there") == 2
+    assert run_main(monkeypatch, *words.format(kitti=kitti).split(), option, tmp_path / "not/there") == 2
     assert "Error: " in capsys.readouterr().err
     assert not (tmp_path / "not").exists()
 
@@ -97,12 +97,12 @@ BAD_INPUTS = {
 
 @pytest.mark.parametrize("case", BAD_INPUTS)
 def test_bad_input_prints_one_line_to_stderr_and_exits_with_2(case, kitti, bag, tmp_path, monkeypatch, capsys):
-    def fill(text):
+    def fill_paths(text):
         return text.format(tmp=tmp_path, kitti=kitti, bag=bag)
 
     arguments, words = BAD_INPUTS[case]
-    assert exit_of(monkeypatch, *map(fill, arguments)) == 2
-    assert fill(words) in error_line(capsys)
+    assert run_main(monkeypatch, *map(fill_paths, arguments)) == 2
+    assert fill_paths(words) in read_error_line(capsys)
 
 
 def test_bag_without_clouds_is_bad_input(tmp_path, monkeypatch, capsys):
@@ -110,7 +110,7 @@ def test_bag_without_clouds_is_bad_input(tmp_path, monkeypatch, capsys):
         made.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
     for command in "nuscenes", "detection":
         assert (
-            exit_of(
+            run_main(
                 monkeypatch,
                 "evaluate",
                 command,
@@ -123,13 +123,13 @@ def test_bag_without_clouds_is_bad_input(tmp_path, monkeypatch, capsys):
             )
             == 2
         )
-        assert "has no frames" in error_line(capsys)
+        assert "has no frames" in read_error_line(capsys)
 
 
 def test_missing_pedestrian_is_reported_and_scores_file_is_kept(tmp_path, monkeypatch, capsys):
-    root = object_folder(tmp_path / "kitti", "")
-    write(tmp_path / "s.json", "those from before")
-    assert exit_of(monkeypatch, "evaluate", "candidates", "--data", root, "--json", tmp_path / "s.json") == 2
+    root = write_object_folder(tmp_path / "kitti", "")
+    write_file(tmp_path / "s.json", "those from before")
+    assert run_main(monkeypatch, "evaluate", "candidates", "--data", root, "--json", tmp_path / "s.json") == 2
     assert "no frame with a Pedestrian label" in capsys.readouterr().err
     assert (tmp_path / "s.json").read_text() == "those from before"
 
@@ -169,7 +169,7 @@ def test_missing_pedestrian_is_reported_and_scores_file_is_kept(tmp_path, monkey
     ],
 )
 def test_invalid_command_exits_with_2(arguments, words, monkeypatch, capsys):
-    assert exit_of(monkeypatch, *arguments) == 2
+    assert run_main(monkeypatch, *arguments) == 2
     assert words in capsys.readouterr().err.splitlines()[-1]
 
 

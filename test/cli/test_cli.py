@@ -11,10 +11,10 @@ import sys
 
 import click
 import pytest
-from cli_samples import evaluate, exit_of, given, run, scores
+from cli_samples import drop_times, evaluate, make_set_options, run_command, run_main
 from click.testing import CliRunner
 from mcap.writer import Writer
-from samples import LABELS, WALKER, lowered_crowd, object_folder, walker_label, write
+from samples import LABELS, WALKER, make_lowered_crowd, make_walker_label, write_file, write_object_folder
 
 from lidar_perception.cli import info
 from lidar_perception.cli.data import open_and_describe
@@ -49,16 +49,16 @@ LEAVES = commands(cli)
 
 @pytest.mark.parametrize("words", [words for words, _ in LEAVES], ids=" ".join)
 def test_help_of_every_command_has_an_example(words):
-    text = run(*words, "--help")
+    text = run_command(*words, "--help")
     assert "Usage: " in text and "Example" in text and f"lidar-perception {' '.join(words)}" in text
 
 
 def test_overview_shows_every_command():
-    text = run("--help")
+    text = run_command("--help")
     assert {words[0] for words, _ in LEAVES} == {*COMMANDS}
     for name, (_, summary) in COMMANDS.items():
         assert f"  {name} " in text and summary.split(".")[0] in " ".join(text.split())
-    assert "lidar-perception" in run("--version")
+    assert "lidar-perception" in run_command("--version")
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -72,16 +72,16 @@ def test_convert_writes_every_scan_to_the_bag(kitti, bag):
 
 
 def test_convert_limit_restricts_the_number_of_frames(kitti, tmp_path):
-    text = run("convert", kitti, "--out", tmp_path / "bag", "--limit", 1)
+    text = run_command("convert", kitti, "--out", tmp_path / "bag", "--limit", 1)
     assert "1 scans of 1" in text.replace("\n", "")
     with Bag(tmp_path / "bag") as opened:
         assert opened.counts[POINTS] == 1
 
 
 def test_convert_skips_and_reports_broken_frames(tmp_path, monkeypatch, capsys):
-    root = object_folder(tmp_path / "kitti", LABELS)
-    broken = write(root / "training/velodyne/000000.bin", b"123")
-    assert exit_of(monkeypatch, "convert", root, "--out", tmp_path / "bag") == 1
+    root = write_object_folder(tmp_path / "kitti", LABELS)
+    broken = write_file(root / "training/velodyne/000000.bin", b"123")
+    assert run_main(monkeypatch, "convert", root, "--out", tmp_path / "bag") == 1
     text = capsys.readouterr().out.replace("\n", "")
     assert "1 scans of 2" in text and str(broken) in text
     with Bag(tmp_path / "bag") as opened:
@@ -93,10 +93,10 @@ def test_convert_replaces_a_bag_only_with_force(kitti, tmp_path, monkeypatch, ca
     out = tmp_path / "run [/final]"  # looks like rich markup
     command = ("convert", kitti, "--out", out, "--limit", 1)
     assert [
-        exit_of(monkeypatch, *command),
-        exit_of(monkeypatch, *command),
-        exit_of(monkeypatch, *command, "--force"),
-        exit_of(monkeypatch, "info", out),
+        run_main(monkeypatch, *command),
+        run_main(monkeypatch, *command),
+        run_main(monkeypatch, *command, "--force"),
+        run_main(monkeypatch, "info", out),
     ] == [0, 2, 0, 0]
     assert capsys.readouterr().out.replace("\n", "").count("run [/final]") == 3
 
@@ -110,11 +110,11 @@ def test_info_folds_names_on_narrow_terminals_only(bag, monkeypatch):
     monkeypatch.setenv("COLUMNS", "60")
     with Bag(bag) as opened:
         topics, kinds = [*opened.topics], [*opened.topics.values()]
-    text = run("info", bag)
+    text = run_command("info", bag)
     assert all(f"│ {topic} " in text for topic in topics) and str(bag) in text
     narrow = Terminal(file=Tty(), width=60, color_system=None)
     monkeypatch.setattr(info, "console", narrow)
-    run("info", bag)
+    run_command("info", bag)
     text = narrow.file.getvalue()
     columns = [[cell.strip() for cell in line.split("│")[1:3]] for line in text.splitlines() if line.startswith("│")]
     assert "…" not in text and max(map(len, text.splitlines())) <= 60
@@ -137,13 +137,13 @@ def test_piped_table_is_never_truncated(wide, monkeypatch):
 
 
 def test_info_json_has_the_content_of_the_table(bag, kitti):
-    content = json.loads(run("info", "--json", bag))
+    content = json.loads(run_command("info", "--json", bag))
     with Bag(bag) as opened:
         assert {row["topic"]: (row["type"], row["messages"]) for row in content["topics"]} == {
             topic: (kind, opened.counts[topic]) for topic, kind in opened.topics.items()
         }
     assert content["seconds"] == pytest.approx(0.1)
-    folder = json.loads(run("info", kitti, "--json"))
+    folder = json.loads(run_command("info", kitti, "--json"))
     assert (folder["frames"], folder["layout"]) == (2, "KITTI object data")
     assert folder["first_cloud"]["labels"] == ["Pedestrian"]
 
@@ -166,19 +166,19 @@ def test_info_lists_topics_that_are_not_read(tmp_path):
         for name, encoding in (("Log", "protobuf"), ("Text", "cdr")):
             writer.register_channel(f"/{name}", encoding, writer.register_schema(name, "", b""))
         writer.finish()
-    assert "Log as protobuf, not read" in run("info", tmp_path / "a.mcap")
-    content = json.loads(run("info", tmp_path / "a.mcap", "--json"))
+    assert "Log as protobuf, not read" in run_command("info", tmp_path / "a.mcap")
+    content = json.loads(run_command("info", tmp_path / "a.mcap", "--json"))
     assert [row["topic"] for row in content["unreadable"]] == ["/Log"]
 
 
 def test_info_describes_a_recording_that_is_not_a_bag(kitti):
-    text = run("info", kitti)
+    text = run_command("info", kitti)
     assert f"{kitti}: KITTI object data, 2 frames, a camera, labelled boxes" in text
     assert "10 Hz assumed" in text and "first cloud: 000000, " in text and "labels: " in text
 
 
 def test_info_shows_topics_types_counts_and_length(bag):
-    text = run("info", bag)
+    text = run_command("info", bag)
     rows = {line.split("│")[1].strip(): line for line in text.splitlines() if "│ /" in line}
     with Bag(bag) as opened:
         assert {*rows} == {*opened.topics}
@@ -207,12 +207,12 @@ def test_evaluate_scores_both_pedestrians(kitti, tmp_path):
 
 
 def test_converted_bag_scores_like_its_folder(kitti, bag, tmp_path):
-    assert scores(evaluate(tmp_path, "--data", bag)) == scores(evaluate(tmp_path, "--data", kitti))
+    assert drop_times(evaluate(tmp_path, "--data", bag)) == drop_times(evaluate(tmp_path, "--data", kitti))
 
 
 def test_evaluate_prints_the_number_of_pedestrians(bag, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
-    assert "2 pedestrians in 2 frames" in run("evaluate", "candidates", "--data", bag)
+    assert "2 pedestrians in 2 frames" in run_command("evaluate", "candidates", "--data", bag)
 
 
 @pytest.mark.parametrize(
@@ -233,7 +233,7 @@ def test_data_argument_and_data_option_are_equivalent(words, tmp_path, monkeypat
     }.items():
         if name == "neither" and words[0] in ("demo", "view"):
             continue
-        assert exit_of(monkeypatch, *words, *value, *out, *results) == 2
+        assert run_main(monkeypatch, *words, *value, *out, *results) == 2
         said[name] = capsys.readouterr().err.splitlines()[-1]
     assert said["argument"] == said["option"] and "none does not exist" in said["argument"]
     assert "expected one DATA" in said["both"]
@@ -243,14 +243,14 @@ def test_data_argument_and_data_option_are_equivalent(words, tmp_path, monkeypat
 
 @pytest.mark.parametrize("name", ["kitti", "KITTI", "kitti-object", "kitti_object"])
 def test_format_names_are_accepted_in_any_spelling(kitti, tmp_path, name):
-    run("convert", "--data", kitti, "--to", name, "--limit", 1, "--out", tmp_path / "k")
+    run_command("convert", "--data", kitti, "--to", name, "--limit", 1, "--out", tmp_path / "k")
     assert (tmp_path / "k/training/velodyne").is_dir()
-    run("simulate", "--to", name, "--frames", 1, "--out", tmp_path / "s")
+    run_command("simulate", "--to", name, "--frames", 1, "--out", tmp_path / "s")
     assert (tmp_path / "s/training/velodyne").is_dir()
 
 
 def test_cloud_without_core_points_has_no_candidates(bag, tmp_path):
-    content = evaluate(tmp_path, "--data", bag, *given("clustering.dbscan.min_samples=100000"))
+    content = evaluate(tmp_path, "--data", bag, *make_set_options("clustering.dbscan.min_samples=100000"))
     for stage in STAGES:
         row = content[stage]["all"]
         assert (row["tp"], row["fp"], row["fn"], row["f1"]) == (0, 0, 2, 0)
@@ -258,8 +258,8 @@ def test_cloud_without_core_points_has_no_candidates(bag, tmp_path):
 
 
 def test_frame_that_cannot_be_read_is_counted_as_skipped(kitti, tmp_path):
-    root = object_folder(tmp_path / "kitti", walker_label(), count=3)
-    write(root / "training/velodyne/000001.bin", b"123")
+    root = write_object_folder(tmp_path / "kitti", make_walker_label(), count=3)
+    write_file(root / "training/velodyne/000001.bin", b"123")
     content = evaluate(tmp_path, "--data", root)
     assert content["frames"] == 2
     (line,) = content["skipped"]
@@ -269,7 +269,7 @@ def test_frame_that_cannot_be_read_is_counted_as_skipped(kitti, tmp_path):
 @pytest.mark.no_cover
 def test_real_scans_score_the_same_from_folder_and_bag(data, tmp_path):
     root = data / "kitti_object"
-    run("convert", root, "--out", tmp_path / "bag", "--limit", 6)
+    run_command("convert", root, "--out", tmp_path / "bag", "--limit", 6)
     content = evaluate(tmp_path, "--data", tmp_path / "bag")
     labels = [path.read_text() for path in sorted(root.glob("training/label_2/*.txt"))[:6]]
     counts = [sum(line.startswith("Pedestrian ") for line in text.splitlines()) for text in labels]
@@ -279,7 +279,7 @@ def test_real_scans_score_the_same_from_folder_and_bag(data, tmp_path):
 
 @pytest.mark.parametrize("command", [["demo"], ["run", "perception"]])
 def test_missing_rclpy_is_reported_before_any_work(command, tmp_path):
-    write(tmp_path / "rclpy/__init__.py", "raise ImportError('not for this Python')")
+    write_file(tmp_path / "rclpy/__init__.py", "raise ImportError('not for this Python')")
     end = subprocess.run(
         [sys.executable, "-m", "lidar_perception.cli.main", *command],
         capture_output=True,
@@ -297,7 +297,7 @@ def test_missing_rclpy_is_reported_before_any_work(command, tmp_path):
 
 
 def test_demo_passes_the_measured_sensor_height_to_its_nodes(tmp_path):
-    write_bag(tmp_path / "bag", [lowered_crowd(i, 1.0) for i in range(3)])
+    write_bag(tmp_path / "bag", [make_lowered_crowd(i, 1.0) for i in range(3)])
     recording = open_and_describe(tmp_path / "bag")
     played = _open_replayed_bag(recording.path, recording)
     pose = _load_node_params(DetectorChoice("candidates"), played).ground.sensor_pose

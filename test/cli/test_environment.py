@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from samples import write
+from samples import write_file
 
 from lidar_perception.nodes import NODES
 
@@ -19,7 +19,7 @@ BASE = "ros studio odometry"  # extras that every command has
 TEST = f"{BASE} test docs benchmark distributed onnx video"
 
 
-def stamp(extras=TEST):
+def make_stamp(extras=TEST):
     """Return the text that marks an environment as up to date."""
     return (
         subprocess.run(
@@ -52,7 +52,7 @@ def test_only_the_lidar_command_is_added_to_path():
 def test_executable_starts_the_node_of_its_name(name, tmp_path):
     """Also in a folder with modules of the same names as those of the package."""
     for module in "numpy", "signal", "lidar_perception":
-        write(tmp_path / f"{module}.py", "raise SystemExit(3)")
+        write_file(tmp_path / f"{module}.py", "raise SystemExit(3)")
     done = subprocess.run([INSTALLED / name, "--help"], cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith(f"Usage: {name} --ros-args")
@@ -71,7 +71,7 @@ def test_help_into_a_closed_pipe_ends_without_error():
 @pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
 def test_concurrent_first_calls_create_one_environment(tmp_path):
     venv = tmp_path / "venv"
-    write(venv / "bin/lidar-perception", "#!/bin/sh\necho ran $1\n").chmod(0o755)
+    write_file(venv / "bin/lidar-perception", "#!/bin/sh\necho ran $1\n").chmod(0o755)
     with open(venv / "lidar-lock", "w") as lock:  # the lock of ./lidar
         fcntl.flock(lock, fcntl.LOCK_EX)
         other = subprocess.Popen(
@@ -82,7 +82,7 @@ def test_concurrent_first_calls_create_one_environment(tmp_path):
             env={**os.environ, "LIDAR_VENV": str(venv), "LIDAR_PYTHON": "/bin/false"},
         )
         assert "waiting for another process" in other.stderr.readline()
-        write(venv / "lidar-setup", stamp())
+        write_file(venv / "lidar-setup", make_stamp())
     assert other.communicate() == ("ran info\n", "") and other.returncode == 0
 
 
@@ -90,7 +90,7 @@ def test_concurrent_first_calls_create_one_environment(tmp_path):
 def test_sourced_ros_does_not_affect_the_new_environment(tmp_path):
     """pip does not install packages that it finds on PYTHONPATH."""
     seen = tmp_path / "seen"
-    python = write(tmp_path / "python", f"#!/bin/sh\necho ${{PYTHONPATH-unset}} >>{seen}\n")
+    python = write_file(tmp_path / "python", f"#!/bin/sh\necho ${{PYTHONPATH-unset}} >>{seen}\n")
     python.chmod(0o755)
     done = subprocess.run(
         [ROOT / "lidar", "info"],
@@ -116,22 +116,22 @@ def test_sourced_ros_does_not_affect_the_new_environment(tmp_path):
         ("info drive.bag", "lidar-perception info drive.bag\n"),
     ],
 )
-def test_lidar_runs_tests_and_benchmark_from_the_checkout(words, ran, environment):
-    assert environment(words) == ran
+def test_lidar_runs_tests_and_benchmark_from_the_checkout(words, ran, run_lidar):
+    assert run_lidar(words) == ran
 
 
 @pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
-def test_help_of_lidar_mentions_test_and_benchmark(environment):
-    first, *more = environment("--help").splitlines()
+def test_help_of_lidar_mentions_test_and_benchmark(run_lidar):
+    first, *more = run_lidar("--help").splitlines()
     assert first == "lidar-perception --help" and {"test", "benchmark"} <= {*" ".join(more).split()}
 
 
 @pytest.fixture
-def environment(tmp_path):
+def run_lidar(tmp_path):
     """Return the output of ./lidar WORDS in an environment whose programs print their arguments."""
     for name in ("python", "lidar-perception"):
-        write(tmp_path / "bin" / name, f"#!/bin/sh\necho {name} $*\n").chmod(0o755)
-    write(tmp_path / "lidar-setup", stamp())
+        write_file(tmp_path / "bin" / name, f"#!/bin/sh\necho {name} $*\n").chmod(0o755)
+    write_file(tmp_path / "lidar-setup", make_stamp())
     return lambda words: (
         subprocess.run(
             [ROOT / "lidar", *words.split()],
@@ -154,17 +154,17 @@ def environment(tmp_path):
         ("detect a.bag --video a.mp4 --dask tcp://a", TEST, TEST),
     ],
 )
-def test_lidar_installs_what_a_command_needs(words, before, after, environment, tmp_path):
-    write(tmp_path / "lidar-setup", stamp(before))
-    environment(words)
-    assert (tmp_path / "lidar-setup").read_text() == stamp(after)
+def test_lidar_installs_what_a_command_needs(words, before, after, run_lidar, tmp_path):
+    write_file(tmp_path / "lidar-setup", make_stamp(before))
+    run_lidar(words)
+    assert (tmp_path / "lidar-setup").read_text() == make_stamp(after)
     log = tmp_path / "setup.log"
     assert not log.exists() if after == before else log.read_text() == (f"python {ROOT}/scripts/set_up.py {after}\n")
 
 
 def test_pip_configuration_is_passed_to_uv(tmp_path, monkeypatch):
     set_up = runpy.run_path(str(ROOT / "scripts/set_up.py"))
-    write(
+    write_file(
         tmp_path / "pip.conf",
         "[global]\nindex-url = https://a/simple\nretries = 3\n"
         "find-links = /never\nextra-index-url =\n  https://b/simple\n  https://c/simple\n"

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import click
 import pytest
-from cli_samples import evaluate, given, run, scores
-from samples import write
+from cli_samples import drop_times, evaluate, make_set_options, run_command
+from samples import write_file
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
@@ -32,12 +32,12 @@ from lidar_perception.types import InputError
 )
 def test_set_help_lists_the_parameters_of_the_command(words, names):
     for spelling in ["--set", "help"], ["--set=help"]:
-        text = run(*words, *spelling)
+        text = run_command(*words, *spelling)
         assert all(name in text for name in names), text
 
 
 def test_set_help_of_candidates_describes_every_parameter():
-    text = run("evaluate", "candidates", "--set", "help")
+    text = run_command("evaluate", "candidates", "--set", "help")
     assert all(
         f"{name} (default" in text and f.metadata["doc"] in text
         for name, f in collect_fields(PAPER).items()
@@ -55,18 +55,18 @@ def test_set_help_of_candidates_describes_every_parameter():
     ],
 )
 def test_set_changes_parameters_of_the_pipeline(bag, tmp_path, flags):
-    changed = scores(evaluate(tmp_path, "--data", bag, *given(*flags)))
+    changed = drop_times(evaluate(tmp_path, "--data", bag, *make_set_options(*flags)))
     assert changed["ground_truth"] == 2
-    assert changed != scores(evaluate(tmp_path, "--data", bag))
+    assert changed != drop_times(evaluate(tmp_path, "--data", bag))
 
 
 @pytest.mark.no_cover
 def test_set_takes_precedence_over_config(bag, tmp_path):
-    few, many = (given(f"clustering.dbscan.min_samples={n}") for n in (10, 100_000))
-    file = write(tmp_path / "p.yaml", "/**:\n  ros__parameters:\n    clustering.dbscan.min_samples: 100000\n")
-    no_clusters = scores(evaluate(tmp_path, "--data", bag, *many))
-    assert scores(evaluate(tmp_path, "--data", bag, "--config", file)) == no_clusters
-    assert scores(evaluate(tmp_path, "--data", bag, "--config", file, *few)) == scores(
+    few, many = (make_set_options(f"clustering.dbscan.min_samples={n}") for n in (10, 100_000))
+    file = write_file(tmp_path / "p.yaml", "/**:\n  ros__parameters:\n    clustering.dbscan.min_samples: 100000\n")
+    no_clusters = drop_times(evaluate(tmp_path, "--data", bag, *many))
+    assert drop_times(evaluate(tmp_path, "--data", bag, "--config", file)) == no_clusters
+    assert drop_times(evaluate(tmp_path, "--data", bag, "--config", file, *few)) == drop_times(
         evaluate(tmp_path, "--data", bag)
     )
 
@@ -93,7 +93,7 @@ def test_set_takes_precedence_over_config(bag, tmp_path):
     ids=range(9),
 )
 def test_ignored_entries_of_a_parameter_file_are_reported(tmp_path, section, words):
-    file = write(tmp_path / "p.yaml", f"/**:\n  ros__parameters:\n    {section}\n")
+    file = write_file(tmp_path / "p.yaml", f"/**:\n  ros__parameters:\n    {section}\n")
     with pytest.raises(InputError) as error:
         read_config(file, PipelineParams())
     assert words in str(error.value) and "\n" not in str(error.value)
@@ -101,7 +101,7 @@ def test_ignored_entries_of_a_parameter_file_are_reported(tmp_path, section, wor
 
 def test_long_invalid_value_is_abbreviated_in_the_error(tmp_path):
     lists = ["a0: &a0 [1, 1]", *(f"a{i + 1}: &a{i + 1} [*a{i}, *a{i}]" for i in range(40))]
-    file = write(
+    file = write_file(
         tmp_path / "p.yaml",
         "/**:\n  ros__parameters:\n    " + "\n    ".join([*lists, "clustering.dbscan.min_samples: *a40"]),
     )
@@ -117,7 +117,7 @@ def test_shipped_parameter_files_load_without_warnings(file, capsys):
 
 
 def test_misspelled_parameter_is_reported(tmp_path, capsys):
-    file = write(
+    file = write_file(
         tmp_path / "p.yaml",
         "/**:\n  ros__parameters:\n    other: {ground: 1}\n"
         "    input.ahead: 3.0\n    ground: {sensor_pose: {heigth: 0.6}}\n",
@@ -141,25 +141,25 @@ somebody_elses_node:
 """
 
 
-def chosen(*arguments, tracking=False) -> dict:
+def parse_options(*arguments, tracking=False) -> dict:
     """Return the values that a command with detector_options() receives."""
-    made = {}
+    options = {}
 
     @click.command(cls=Command)
     @detector_options(tracking=tracking)
-    def verb(**given):
-        made.update(given)
+    def command(**values):
+        options.update(values)
 
-    verb.main([*map(str, arguments)], standalone_mode=False)
-    return made
+    command.main([*map(str, arguments)], standalone_mode=False)
+    return options
 
 
 def test_only_sections_of_the_command_are_read(tmp_path, capsys):
-    file = write(tmp_path / "p.yaml", SECTIONS)
-    made = chosen("--config", file, "--set", "crop.min_range=3", tracking=True)
+    file = write_file(tmp_path / "p.yaml", SECTIONS)
+    made = parse_options("--config", file, "--set", "crop.min_range=3", tracking=True)
     assert made["detector"].settings == {"ground.method": "threshold", "fused.scores.car": 0.7, "crop.min_range": 3.0}
     assert made["tracking"].min_score == 0.3
-    other = chosen("--weights", "pointnet", "--config", file)["detector"]
+    other = parse_options("--weights", "pointnet", "--config", file)["detector"]
     assert other.settings == {"ground.method": "threshold", "crop.min_range": 9.0, "pointnet.min_points": 5}
     assert capsys.readouterr().err == ""
 
@@ -173,16 +173,16 @@ def test_only_sections_of_the_command_are_read(tmp_path, capsys):
     ],
 )
 def test_probable_typos_in_a_parameter_file_are_reported(text, said, tmp_path, capsys):
-    file = write(tmp_path / "p.yaml", text)
-    assert chosen("--config", file)["detector"].settings == {}
+    file = write_file(tmp_path / "p.yaml", text)
+    assert parse_options("--config", file)["detector"].settings == {}
     assert said in capsys.readouterr().err
 
 
 def test_detector_settings_take_precedence_over_options():
-    made = chosen(
+    made = parse_options(
         "--weights",
         "pointpillars",
-        *given(
+        *make_set_options(
             "pointpillars.scores.car=0.7",
             "pointpillars.range=around",
             "pointpillars.device=cpu",

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.no_cover  # covered by other tests
 SCANS = DATA / "kitti_object/training/velodyne_reduced"
 
 
-def reference(xyz, eps, min_samples):
+def cluster_by_sklearn(xyz, eps, min_samples):
     """Return scikit-learn's labels plus one, so that noise is 0. Both compute in float64."""
     if len(xyz) == 0:
         return np.zeros(0, np.int32)
@@ -31,17 +31,17 @@ def reference(xyz, eps, min_samples):
     return model.fit_predict(np.asarray(xyz, np.float64)) + 1
 
 
-def core_mask(xyz, eps, min_samples):
+def find_core_points(xyz, eps, min_samples):
     tree = cKDTree(np.asarray(xyz, np.float64))
     return tree.query_ball_point(tree.data, eps, return_length=True) >= min_samples
 
 
-def partition(labels):
+def to_partition(labels):
     """Return the clusters as a set of sets of indices, without their ids."""
     return {frozenset(np.flatnonzero(labels == k).tolist()) for k in np.unique(labels) if k > 0}
 
 
-def blobs(rng, centres, size, spread):
+def make_blobs(rng, centres, size, spread):
     """Return points (N, 3) float32 around centres (K, 3), and the centre of each, 0..K-1."""
     centres = np.asarray(centres, float)
     xyz = np.repeat(centres, size, axis=0) + rng.uniform(-spread, spread, (size * len(centres), 3))
@@ -51,7 +51,7 @@ def blobs(rng, centres, size, spread):
 def assert_same(xyz, eps, min_samples):
     result = dbscan(xyz, eps, min_samples)
     assert result.dtype == np.int32 and result.shape == (len(xyz),)
-    np.testing.assert_array_equal(result, reference(xyz, eps, min_samples))
+    np.testing.assert_array_equal(result, cluster_by_sklearn(xyz, eps, min_samples))
 
 
 @given(
@@ -78,7 +78,7 @@ def test_labels_equal_sklearn_with_many_equal_distances(seed, count, reach, min_
 def test_border_points_join_the_first_cluster(min_samples):
     # Dense balls so close to each other that most border points are between two of them.
     rng = np.random.default_rng(3)
-    xyz, _ = blobs(rng, [[0, 0, 0], [0.9, 0, 0], [0, 0.9, 0], [0.9, 0.9, 0.2]], 40, 0.25)
+    xyz, _ = make_blobs(rng, [[0, 0, 0], [0.9, 0, 0], [0, 0.9, 0], [0.9, 0.9, 0.2]], 40, 0.25)
     bridge = rng.uniform(-0.2, 1.1, (60, 3)).astype(np.float32)
     mixed = rng.permutation(np.concatenate([xyz, bridge]))
     for eps in (0.15, 0.25, 0.35):
@@ -122,17 +122,17 @@ def test_labels_equal_sklearn_on_real_clouds(scan):
     params = DbscanParams()
     result = distance_aware_dbscan(xyz, params)
     assert result.max() > 20
-    np.testing.assert_array_equal(result, banded_reference(xyz, params))
+    np.testing.assert_array_equal(result, cluster_bands_by_sklearn(xyz, params))
 
 
-def banded_reference(xyz, params):
+def cluster_bands_by_sklearn(xyz, params):
     """Cluster each band with scikit-learn and number the clusters consecutively; ranges are float32."""
     limits = [-np.inf, *params.range_limits, np.inf]
     ranges = np.sqrt(xyz[:, 0] * xyz[:, 0] + xyz[:, 1] * xyz[:, 1])
     labels, last = np.zeros(len(xyz), int), 0
     for low, high, eps in zip(limits, limits[1:], params.eps):
         members = (ranges >= low) & (ranges < high)
-        result = reference(xyz[members], eps, params.min_samples)
+        result = cluster_by_sklearn(xyz[members], eps, params.min_samples)
         labels[members] = np.where(result > 0, result + last, 0)
         last = labels.max(initial=0)
     return labels
@@ -143,7 +143,7 @@ def test_distance_aware_dbscan_equals_sklearn_in_each_band(seed, count, min_samp
     rng = np.random.default_rng(seed)
     xyz = (rng.uniform(-6, 6, (count, 3)) * [1, 1, 0.2]).astype(np.float32)
     params = DbscanParams(range_limits=(2.0, 3.5, 5.0), eps=(0.2, 0.5, 0.3, 0.8), min_samples=min_samples)
-    np.testing.assert_array_equal(distance_aware_dbscan(xyz, params), banded_reference(xyz, params))
+    np.testing.assert_array_equal(distance_aware_dbscan(xyz, params), cluster_bands_by_sklearn(xyz, params))
 
 
 @pytest.mark.parametrize("limit, at", [(15.0, [15, 0]), (15.0, [0, -15]), (15.0, [9, 12]), (30.0, [-18, 24])])
@@ -169,7 +169,7 @@ def test_cluster_across_a_range_limit_is_split():
 JOIN = DbscanParams(join_bands=True)
 
 
-def slow_join(xyz, labels, params):
+def join_bands_slowly(xyz, labels, params):
     """Join clusters of neighbouring bands with a pair of points within the smaller eps."""
     band = np.searchsorted(params.range_limits, np.hypot(*xyz[:, :2].T.astype(np.float32)), "right")
     joined = {frozenset([k]) for k in range(1, labels.max(initial=0) + 1)}
@@ -188,7 +188,7 @@ def test_join_bands_joins_only_touching_clusters(seed, count):
     cut = DbscanParams(range_limits=(2.0, 4.0), eps=(0.9, 0.7, 1.0), min_samples=3)
     labels = distance_aware_dbscan(xyz, cut)
     result = distance_aware_dbscan(xyz, DbscanParams(cut.range_limits, cut.eps, 3, join_bands=True))
-    assert partition(result) == slow_join(xyz, labels, cut)
+    assert to_partition(result) == join_bands_slowly(xyz, labels, cut)
     np.testing.assert_array_equal(result > 0, labels > 0)
     first = [np.flatnonzero(result == k)[0] for k in range(1, result.max(initial=0) + 1)]
     assert len(set(result.tolist()) - {0}) == len(first)
@@ -225,8 +225,8 @@ def test_clusters_100_km_away_are_found_like_near_ones():
     rng = np.random.default_rng(8)
     xyz = (rng.integers(-64, 64, (400, 3)) / 64).astype(np.float32)
     moved = xyz + np.float32([8e4, -6e4, 16])
-    np.testing.assert_array_equal(dbscan(moved, 0.25, 5), reference(moved, 0.25, 5))
-    assert partition(dbscan(moved, 0.25, 5)) == partition(dbscan(xyz, 0.25, 5))
+    np.testing.assert_array_equal(dbscan(moved, 0.25, 5), cluster_by_sklearn(moved, 0.25, 5))
+    assert to_partition(dbscan(moved, 0.25, 5)) == to_partition(dbscan(xyz, 0.25, 5))
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -235,11 +235,11 @@ def test_permuting_points_permutes_core_clusters_and_noise(seed):
     xyz = rng.uniform(-1, 1, (250, 3)).astype(np.float32)
     order = rng.permutation(len(xyz))
     eps, min_samples = 0.35, 6
-    core = core_mask(xyz, eps, min_samples)
+    core = find_core_points(xyz, eps, min_samples)
     labels = dbscan(xyz, eps, min_samples)
     back = np.empty_like(labels)
     back[order] = dbscan(xyz[order], eps, min_samples)
-    assert partition(np.where(core, labels, 0)) == partition(np.where(core, back, 0))
+    assert to_partition(np.where(core, labels, 0)) == to_partition(np.where(core, back, 0))
     np.testing.assert_array_equal(labels == 0, back == 0)
 
 
@@ -248,7 +248,7 @@ def test_ids_are_1_to_K_by_first_core_point(seed, count, min_samples):
     rng = np.random.default_rng(seed)
     xyz = rng.uniform(-2, 2, (count, 3)).astype(np.float32)
     labels = dbscan(xyz, 0.5, min_samples)
-    core = core_mask(xyz, 0.5, min_samples)
+    core = find_core_points(xyz, 0.5, min_samples)
     assert np.unique(labels[labels > 0]).tolist() == list(range(1, labels.max() + 1))
     firsts = [np.flatnonzero(core & (labels == k))[0] for k in range(1, labels.max() + 1)]
     assert firsts == sorted(firsts)
@@ -262,7 +262,7 @@ def test_min_samples_1_gives_the_connected_components():
     assert labels.min() == 1
     pairs = cKDTree(xyz.astype(float)).query_pairs(0.5, output_type="ndarray")
     assert len(pairs) and (labels[pairs[:, 0]] == labels[pairs[:, 1]]).all()
-    np.testing.assert_array_equal(labels, reference(xyz, 0.5, 1))
+    np.testing.assert_array_equal(labels, cluster_by_sklearn(xyz, 0.5, 1))
 
 
 def test_min_samples_above_point_count_gives_only_noise():
@@ -277,7 +277,7 @@ CENTRES = np.array([[5, 3, 0], [6.5, -4, 0.5], [-9, 2, -1], [-20, -11, 0], [33, 
 
 @pytest.mark.parametrize("turn", [[[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]])
 def test_quarter_turns_about_z_keep_the_clusters(turn):
-    xyz, _ = blobs(np.random.default_rng(11), CENTRES, 300, 0.25)
+    xyz, _ = make_blobs(np.random.default_rng(11), CENTRES, 300, 0.25)
     turned = xyz.copy()
     turned[:, :2] = xyz[:, :2] @ np.array(turn, np.float32).T  # exact
     labels = distance_aware_dbscan(xyz)
@@ -287,9 +287,9 @@ def test_quarter_turns_about_z_keep_the_clusters(turn):
 
 @given(*[st.floats(-500, 500)] * 3)
 def test_translation_keeps_well_separated_clusters(x, y, z):
-    xyz, blob = blobs(np.random.default_rng(13), CENTRES, 60, 0.2)
+    xyz, blob = make_blobs(np.random.default_rng(13), CENTRES, 60, 0.2)
     labels = dbscan(xyz + np.float32([x, y, z]), 0.4, 5)
-    assert partition(labels) == partition(blob + 1)
+    assert to_partition(labels) == to_partition(blob + 1)
 
 
 def test_layout_and_dtype_of_the_input_do_not_matter():

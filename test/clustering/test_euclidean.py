@@ -26,27 +26,27 @@ SETTINGS = [
 SETTING_NAMES = ["local", "local, not merged", "global, not merged", "global", "no MinPts"]
 
 
-def blobs(seed, centres, count=200, spread=0.15):
+def make_blobs(seed, centres, count=200, spread=0.15):
     rng = np.random.default_rng(seed)
     centres = np.asarray(centres, float)
     points = centres[:, None] + rng.normal(0, spread, (len(centres), count, 3))
     return points.reshape(-1, 3).astype(np.float32)
 
 
-def scene(seed, count=3000):
+def make_scene(seed, count=3000):
     """Return a cloud of dense and sparse clusters, a line and single points."""
     rng = np.random.default_rng(seed)
     return np.concatenate(
         [
-            blobs(seed, rng.uniform(-20, 20, (8, 3)) * [1, 1, 0.1], count // 10, 0.2),
-            blobs(seed + 1, rng.uniform(-40, 40, (5, 3)) * [1, 1, 0.1], 12, 0.4),
+            make_blobs(seed, rng.uniform(-20, 20, (8, 3)) * [1, 1, 0.1], count // 10, 0.2),
+            make_blobs(seed + 1, rng.uniform(-40, 40, (5, 3)) * [1, 1, 0.1], 12, 0.4),
             np.stack([np.linspace(-10, 10, 100), np.full(100, 5.0), np.zeros(100)], axis=1),
             rng.uniform(-30, 30, (100, 3)),
         ]
     ).astype(np.float32)
 
 
-def same_partition(a, b):
+def is_same_partition(a, b):
     pairs = np.unique(np.stack([a, b], axis=1), axis=0)
     return len(pairs) == len(np.unique(a)) == len(np.unique(b)) and np.array_equal(a == 0, b == 0)
 
@@ -60,7 +60,7 @@ DEGENERATE = {
     "a plane of equal distances": np.stack(np.meshgrid(*[np.arange(20) * 0.25] * 2, [0]), axis=-1).reshape(-1, 3),
     "coincident clusters": np.repeat(np.array([[0, 0, 0], [5, 0, 0]]), 50, axis=0),
     "far apart": np.array([[0, 0, 0]] * 12 + [[1e6, 0, 0]] * 12 + [[-1e6, 1e6, 100]]),
-    "one dense, one far": np.concatenate([blobs(0, [[0, 0, 0]], 300, 0.01), [[3000, 0, 0], [3003, 0, 0]]]),
+    "one dense, one far": np.concatenate([make_blobs(0, [[0, 0, 0]], 300, 0.01), [[3000, 0, 0], [3003, 0, 0]]]),
 }
 
 
@@ -76,8 +76,8 @@ def test_degenerate_clouds_equal_the_plain_implementation(xyz, params):
 @pytest.mark.parametrize("params", SETTINGS, ids=SETTING_NAMES)
 @pytest.mark.parametrize("seed", range(3))
 def test_scenes_equal_the_plain_implementation(seed, params):
-    labels = cluster_euclidean(scene(seed), params)
-    np.testing.assert_array_equal(labels, plain_euclidean(scene(seed), params))
+    labels = cluster_euclidean(make_scene(seed), params)
+    np.testing.assert_array_equal(labels, plain_euclidean(make_scene(seed), params))
     # Check that the comparison is not trivial.
     assert labels.max() > 3 and ((labels == 0).any() or params.beta == 0)
 
@@ -117,9 +117,9 @@ def test_real_scan_equals_the_plain_implementation(threshold, data):
 
 @pytest.mark.parametrize("params", SETTINGS, ids=SETTING_NAMES)
 def test_permuting_points_permutes_labels(params):
-    xyz, order = scene(5), np.random.default_rng(0).permutation(len(scene(5)))
+    xyz, order = make_scene(5), np.random.default_rng(0).permutation(len(make_scene(5)))
     a, b = cluster_euclidean(xyz, params)[order], cluster_euclidean(xyz[order], params)
-    assert same_partition(a, b)
+    assert is_same_partition(a, b)
     first = b[np.sort(np.unique(b, return_index=True)[1])]
     # Clusters are numbered by their first point.
     assert np.array_equal(first[first > 0], np.arange(1, b.max() + 1))
@@ -128,7 +128,7 @@ def test_permuting_points_permutes_labels(params):
 @pytest.mark.parametrize("params", SETTINGS[:2], ids=SETTING_NAMES[:2])
 def test_labels_do_not_depend_on_the_frame(params):
     """The clusters are so far apart that rounding does not matter."""
-    xyz = blobs(3, [[0, 0, 0], [8, 0, 0], [0, 9, 1], [-7, -7, 0]])
+    xyz = make_blobs(3, [[0, 0, 0], [8, 0, 0], [0, 9, 1], [-7, -7, 0]])
     turn = np.array([[np.cos(0.7), -np.sin(0.7), 0], [np.sin(0.7), np.cos(0.7), 0], [0, 0, 1]])
     moved = (xyz.astype(float) @ turn.T + [30, -20, 1]).astype(np.float32)
     labels = cluster_euclidean(xyz, params)
@@ -141,7 +141,7 @@ def test_labels_do_not_depend_on_the_frame(params):
 
 
 def test_far_outliers_do_not_change_local_thresholds():
-    xyz, far = scene(2), np.float32([[5e4, 0, 0], [0, -9e4, 10], [1e5, 1e5, 1e5]])
+    xyz, far = make_scene(2), np.float32([[5e4, 0, 0], [0, -9e4, 10], [1e5, 1e5, 1e5]])
     # MinPts = beta ln N counts all points (Eq. 7); three more do not reach the next integer here.
     assert np.ceil(0.5 * np.log(len(xyz))) == np.ceil(0.5 * np.log(len(xyz) + 3))
     labels = cluster_euclidean(np.concatenate([xyz, far]), LOCAL)
@@ -150,26 +150,26 @@ def test_far_outliers_do_not_change_local_thresholds():
 
 
 def test_min_size_only_drops_small_clusters():
-    xyz, base = scene(1), replace(LOCAL, gamma=0.0)
+    xyz, base = make_scene(1), replace(LOCAL, gamma=0.0)
     unfiltered = cluster_euclidean(xyz, replace(base, min_size=1))
     size = np.bincount(unfiltered)[unfiltered]
     for min_size in (2, 10, 40):
         labels = cluster_euclidean(xyz, replace(base, min_size=min_size))
-        assert same_partition(labels, np.where(size >= min_size, unfiltered, 0))
+        assert is_same_partition(labels, np.where(size >= min_size, unfiltered, 0))
 
 
 def test_gamma_merges_clusters_nearer_than_their_diameters():
     """The boxes have diagonal 2: centres 1.5 apart are nearer than 0.8 * 2, 1.7 apart are not."""
 
-    def walls(distance):
+    def make_walls(distance):
         line = np.linspace(-1, 1, 60)
         one = np.stack([np.zeros(60), line, np.zeros(60)], axis=1)
         return np.concatenate([one, one + [distance, 0, 0]]).astype(np.float32)
 
     params = replace(LOCAL, radius=0.3)
-    assert cluster_euclidean(walls(1.5), params).max() == 1
-    assert cluster_euclidean(walls(1.7), params).max() == 2
-    assert cluster_euclidean(walls(1.5), replace(params, gamma=0.0)).max() == 2
+    assert cluster_euclidean(make_walls(1.5), params).max() == 1
+    assert cluster_euclidean(make_walls(1.7), params).max() == 2
+    assert cluster_euclidean(make_walls(1.5), replace(params, gamma=0.0)).max() == 2
 
 
 def test_local_threshold_adapts_to_the_density():

@@ -48,7 +48,7 @@ def apply_to_one(function, xyz, *rest):
     return function(xyz, np.ones(len(xyz), np.int32), *rest)[0]
 
 
-def least_area(xy):
+def compute_least_area(xy):
     """Return the area of the smallest enclosing rectangle, from all edges of SciPy's convex hull."""
     hull = ConvexHull(xy.astype(float))
     normals = hull.equations[:, :2]
@@ -56,7 +56,7 @@ def least_area(xy):
     return (np.ptp(along, axis=1) * np.ptp(normals @ hull.points.T, axis=1)).min()
 
 
-def l_shaped_car(rng, yaw, noise=0.01):
+def make_l_shaped_car(rng, yaw, noise=0.01):
     """Return points on the two visible sides of a car, and its box."""
     length, width, height = rng.uniform(3.6, 4.8), rng.uniform(1.5, 1.9), rng.uniform(1.3, 1.7)
     first, second = rng.integers(60, 150), rng.integers(40, 80)
@@ -68,7 +68,7 @@ def l_shaped_car(rng, yaw, noise=0.01):
     return ((rotate(flat, yaw) + centre).astype(np.float32), np.array([*centre, length, width, height, yaw]))
 
 
-def angle_between(a, b, period=np.pi):
+def compute_angle(a, b, period=np.pi):
     return np.abs((np.asarray(a) - b + period / 2) % period - period / 2)
 
 
@@ -120,7 +120,7 @@ def test_min_area_box_has_the_least_area(seed, angle):
     xyz = (xyz + rng.uniform(-50, 50, 3)).astype(np.float32)
     box = apply_to_one(fit_boxes, xyz, "min_area").astype(float)
     area = box[3] * box[4]
-    assert area == pytest.approx(least_area(xyz[:, :2]), rel=1e-5)
+    assert area == pytest.approx(compute_least_area(xyz[:, :2]), rel=1e-5)
     _, sides, _ = cv2.minAreaRect(xyz[:, :2] - xyz[0, :2])
     assert area <= sides[0] * sides[1] * (1 + 1e-4)
     spans = np.ptp(rotate(xyz, angle), axis=0)
@@ -135,7 +135,7 @@ def test_min_area_box_of_convex_points_has_the_least_area(seed, count, radius):
     xyz = np.column_stack([np.cos(angles), 0.7 * np.sin(angles), angles]) * radius
     xyz = xyz.astype(np.float32)
     box = apply_to_one(fit_boxes, xyz, "min_area").astype(float)
-    assert box[3] * box[4] == pytest.approx(least_area(xyz[:, :2]), rel=1e-5)
+    assert box[3] * box[4] == pytest.approx(compute_least_area(xyz[:, :2]), rel=1e-5)
 
 
 @given(seeds, st.floats(-10, 10))
@@ -154,16 +154,16 @@ def test_rotating_a_cloud_rotates_its_min_area_box(seed, angle):
 def test_rotating_a_car_rotates_its_l_shape_box(seed, angle):
     # A rotation by an integer number of degrees maps the tested angles onto themselves.
     rng = np.random.default_rng(seed)
-    xyz, _ = l_shaped_car(rng, np.radians(rng.integers(0, 360) + 0.2))
+    xyz, _ = make_l_shaped_car(rng, np.radians(rng.integers(0, 360) + 0.2))
     before = apply_to_one(fit_boxes, xyz, "l_shape")
     assert_rotated(before, apply_to_one(fit_boxes, rotate(xyz, angle), "l_shape"), angle, 1e-3)
 
 
 @given(seeds, st.floats(-np.pi, np.pi))
 def test_l_shape_recovers_a_car_from_two_sides(seed, yaw):
-    xyz, car = l_shaped_car(np.random.default_rng(seed), yaw)
+    xyz, car = make_l_shaped_car(np.random.default_rng(seed), yaw)
     box = apply_to_one(fit_boxes, xyz, "l_shape")
-    assert np.degrees(angle_between(box[6], yaw)) < 2
+    assert np.degrees(compute_angle(box[6], yaw)) < 2
     assert np.linalg.norm(box[:2] - car[:2]) < 0.05
     np.testing.assert_allclose(box[3:5], car[3:5], atol=0.1)
 
@@ -175,7 +175,7 @@ def test_l_shape_recovers_yaw_where_min_area_fails():
     flat[:80, 0] = flat[80:, 1] = side
     xyz = rotate(flat + rng.uniform(-0.01, 0.01, flat.shape), 0.5)
     yaws = [apply_to_one(fit_boxes, xyz, shape)[6] for shape in ("l_shape", "min_area")]
-    errors = np.degrees(angle_between(yaws, 0.5, np.pi / 2))
+    errors = np.degrees(compute_angle(yaws, 0.5, np.pi / 2))
     assert errors[0] < 1 and errors[1] > 30
 
 
@@ -214,10 +214,10 @@ def test_coincident_or_collinear_points_have_a_box(name, xyz, length, yaw):
     for shape in ("min_area", "l_shape"):
         box = apply_to_one(fit_boxes, xyz, shape)
         np.testing.assert_allclose(box[3:5], [length, 0], atol=2e-6)
-        assert angle_between(box[6], yaw) < 1e-5 and -QUARTER_TURN <= box[6] < QUARTER_TURN
+        assert compute_angle(box[6], yaw) < 1e-5 and -QUARTER_TURN <= box[6] < QUARTER_TURN
     ellipse = apply_to_one(fit_ellipses, xyz)
     assert ellipse[2] >= length / 2 and ellipse[3] == pytest.approx(0, abs=1e-5)
-    assert length == 0 or angle_between(ellipse[4], yaw) < 1e-5
+    assert length == 0 or compute_angle(ellipse[4], yaw) < 1e-5
 
 
 @each_shape
@@ -253,7 +253,7 @@ def test_ellipse_of_uniform_points_is_recovered(seed, yaw, ratio):
     ellipse = apply_to_one(fit_ellipses, rotate(flat, yaw) + centre)
     np.testing.assert_allclose(ellipse[:2], centre[:2], atol=0.08)
     np.testing.assert_allclose(ellipse[2:4], axes, rtol=0.03)
-    assert angle_between(ellipse[4], yaw) < 0.1
+    assert compute_angle(ellipse[4], yaw) < 0.1
     assert -QUARTER_TURN <= ellipse[4] < QUARTER_TURN
 
 
@@ -297,7 +297,7 @@ def test_boxes_of_real_cars_have_the_yaw_of_the_cars():
             inside = xyz[points_in_box(xyz, car)]
             for shape, result in errors.items() if len(inside) >= 30 else ():
                 yaw = apply_to_one(fit_boxes, inside, shape)[6]
-                result.append(np.degrees(angle_between(yaw, car[6], np.pi / 2)))
+                result.append(np.degrees(compute_angle(yaw, car[6], np.pi / 2)))
     assert len(errors["l_shape"]) > 100
     assert np.median(errors["l_shape"]) < 1 and np.percentile(errors["l_shape"], 90) < 6
     assert np.mean(errors["l_shape"]) < np.mean(errors["min_area"])

@@ -15,7 +15,7 @@ from lidar_perception.clustering.params import DbscanParams, EuclideanParams
 REACH = 0.5
 
 
-def shell(n, gap, seed=0):
+def make_shell(n, gap, seed=0):
     """Return half of the points at x = 15 m and half on a hemisphere around them, which is farther from the
     sensor. The radius of the hemisphere is (1 + gap) * REACH.
     """
@@ -45,8 +45,8 @@ def always_thin(monkeypatch):
 
 @each_method
 def test_points_slightly_farther_than_eps_are_separate_clusters(method):
-    assert METHODS[method](shell(3000, 0.001)).max() == 2
-    assert METHODS[method](shell(3000, -0.001)).max() == 1
+    assert METHODS[method](make_shell(3000, 0.001)).max() == 2
+    assert METHODS[method](make_shell(3000, -0.001)).max() == 1
 
 
 @each_method
@@ -92,6 +92,6 @@ def test_cost_of_joining_cells_is_linear(gap, monkeypatch):
     monkeypatch.setattr(dbscan_cells, "_join_cells", count_work)
     for count in (20_000, 80_000):
         works.append(0)
-        METHODS["dbscan"](shell(count, gap))
+        METHODS["dbscan"](make_shell(count, gap))
     assert works[1] < 5 * max(works[0], 20_000 * 50), works
     assert works[1] < 100 * 80_000

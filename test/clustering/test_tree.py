@@ -30,7 +30,7 @@ from lidar_perception.clustering.tree import (
 pytestmark = pytest.mark.no_cover  # covered by other tests
 
 
-def sphere(rng, n):
+def draw_sphere(rng, n):
     normal = rng.normal(size=(n, 3))
     return normal / np.linalg.norm(normal, axis=1)[:, None] / 2
 
@@ -40,9 +40,9 @@ ARRANGEMENTS = {
     "a cube": lambda rng, n: rng.random((n, 3)),
     "equal": lambda rng, n: np.full((n, 3), 0.3),
     "a line": lambda rng, n: np.linspace(0, 1, n)[:, None] * [1, 2, -1],
-    "a sphere": sphere,
+    "a sphere": draw_sphere,
     "a sphere and its centre": lambda rng, n: np.concatenate(
-        [sphere(rng, n // 2), rng.normal(0, 1e-5, (n - n // 2, 3))]
+        [draw_sphere(rng, n // 2), rng.normal(0, 1e-5, (n - n // 2, 3))]
     ),
     "two blobs out of reach": lambda rng, n: rng.random((n, 3)) * 0.1 + (np.arange(n) % 2)[:, None] * [0, 0, 0.7],
     "a blob and dust": lambda rng, n: rng.random((n, 3)) * np.where(np.arange(n) % 2, 1e-3, 3)[:, None],
@@ -109,10 +109,10 @@ def test_touching_labels_equal_brute_force(data):
     count = label.max() + 1
     assert len(pairs) < count
 
-    def sets(a, b):
+    def find_components(a, b):
         return connected_components(coo_matrix((np.ones(len(a)), (a, b)), (count, count)))[1]
 
-    np.testing.assert_array_equal(sets(*pairs.T), sets(label[i], label[j]))
+    np.testing.assert_array_equal(find_components(*pairs.T), find_components(label[i], label[j]))
 
 
 SETTINGS = [

@@ -18,7 +18,7 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
-from samples import STAMP, png_header, scene, write
+from samples import STAMP, make_png_header, make_scene, write_file
 
 from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.bag_metadata import LATCHED_QOS
@@ -34,12 +34,12 @@ from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, IMAGE, POINTS,
 from msg_utils.point_cloud2 import to_array
 
 
-def test_recording_returns_the_written_scans(written):
-    recording = open_recording(written)
+def test_recording_returns_the_written_scans(sample_bag):
+    recording = open_recording(sample_bag)
     assert len(recording) == 3
     for i, (scan, read) in enumerate(zip(scans(), recording, strict=True)):
         frame = read.load()
-        assert same_cloud(scene(i), frame.xyz)
+        assert same_cloud(make_scene(i), frame.xyz)
         assert np.array_equal(scan.load().intensity, frame.intensity)
         assert (frame.stamp_ns, frame.frame_id) == (scan.stamp_ns, "velodyne")
         assert (read.stamp_ns, read.name, read.index) == (scan.stamp_ns, str(scan.stamp_ns), i)
@@ -65,7 +65,7 @@ def test_clouds_are_stored_bit_by_bit(tmp_path):
 
 
 def test_missing_labels_camera_and_pose_are_not_written(tmp_path):
-    write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(scene(), STAMP))])
+    write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(make_scene(), STAMP))])
     recording = open_recording(tmp_path / "bag")
     (read,) = recording
     assert read.truth() is None and read.camera() is None and read.pose() is None
@@ -74,46 +74,46 @@ def test_missing_labels_camera_and_pose_are_not_written(tmp_path):
 
 
 def test_empty_labels_are_not_missing_labels(tmp_path):
-    write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(scene(), STAMP), GroundTruth.of([], []))])
+    write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(make_scene(), STAMP), GroundTruth.of([], []))])
     (read,) = open_recording(tmp_path / "bag")
     assert len(read.truth()) == 0
 
 
 def test_images_are_stored_byte_by_byte(tmp_path):
-    image = write(tmp_path / "image.png", png_header(3, 2) + b"pixels")
-    write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(scene(), STAMP), image=image)], images=True)
+    image = write_file(tmp_path / "image.png", make_png_header(3, 2) + b"pixels")
+    write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(make_scene(), STAMP), image=image)], images=True)
     with Bag(tmp_path / "bag") as bag:
         ((_, stamp, msg),) = bag.messages({IMAGE})
     assert (bytes(msg.data), msg.format, stamp) == (image.read_bytes(), "png", STAMP)
 
 
-def test_calibration_is_written_before_its_cloud_when_it_changes(written):
-    order = [(t, s) for t, s, _ in message_bytes(written)]
+def test_calibration_is_written_before_its_cloud_when_it_changes(sample_bag):
+    order = [(t, s) for t, s, _ in message_bytes(sample_bag)]
     for topic in LATCHED:
         assert [s for t, s in order if t == topic] == [STAMP, STAMP + 2 * 10**8]
     for stamp in (STAMP, STAMP + 2 * 10**8):
         assert order.index((CAMERA_INFO, stamp)) < order.index((POINTS, stamp))
 
 
-def test_rosbags_reads_the_bag(written):
-    with AnyReader([written]) as reader:
+def test_rosbags_reads_the_bag(sample_bag):
+    with AnyReader([sample_bag]) as reader:
         got = [(c.topic, s, bytes(data)) for c, s, data in reader.messages()]
         types = {c.topic: c.msgtype for c in reader.connections}
         for connection, _, data in reader.messages():
             reader.deserialize(data, connection.msgtype)
-    assert got == message_bytes(written)
+    assert got == message_bytes(sample_bag)
     assert types[POINTS] == "sensor_msgs/msg/PointCloud2"
 
 
-def test_mcap_reads_the_bag_and_verifies_its_checksums(written):
-    with open(written / "drive.mcap", "rb") as stream:
+def test_mcap_reads_the_bag_and_verifies_its_checksums(sample_bag):
+    with open(sample_bag / "drive.mcap", "rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         got = [
             (channel.topic, m.log_time, m.data, channel.message_encoding, schema.encoding)
             for schema, channel, m in reader.iter_messages(log_time_order=False)
         ]
         assert reader.get_header().profile == "ros2"
-    assert sorted(got) == sorted((*row, "cdr", "ros2msg") for row in message_bytes(written))
+    assert sorted(got) == sorted((*row, "cdr", "ros2msg") for row in message_bytes(sample_bag))
 
 
 def test_zstd_chunks_hold_several_clouds(tmp_path):
@@ -144,23 +144,23 @@ def test_bag_has_the_requested_compression(tmp_path, compression, pack):
         assert [raw for *_, raw in bag.raw_messages({POINTS})] == 3 * [data]
 
 
-def test_calibrations_are_latched_and_clouds_are_not(written):
-    with Bag(written) as bag:
+def test_calibrations_are_latched_and_clouds_are_not(sample_bag):
+    with Bag(sample_bag) as bag:
         for topic in bag.topics:
             (quality,) = bag.qos(topic)
             latched = quality.durability.name == "TRANSIENT_LOCAL"
             assert latched == (topic in LATCHED)
             assert quality.reliability.name == "RELIABLE"
-    with open(written / "drive.mcap", "rb") as stream:
+    with open(sample_bag / "drive.mcap", "rb") as stream:
         channels = make_reader(stream).get_summary().channels.values()
     for channel in channels:
         (quality,) = yaml.safe_load(channel.metadata["offered_qos_profiles"])
         assert (quality["durability"] == "transient_local") == (channel.topic in LATCHED)
 
 
-def test_metadata_matches_the_file(written):
-    info = yaml.safe_load((written / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
-    rows = message_bytes(written)
+def test_metadata_matches_the_file(sample_bag):
+    info = yaml.safe_load((sample_bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    rows = message_bytes(sample_bag)
     counts = {t["topic_metadata"]["name"]: t["message_count"] for t in info["topics_with_message_count"]}
     assert counts == {topic: sum(t == topic for t, _, _ in rows) for topic in counts}
     assert counts[POINTS] == 3 and counts[TRUTH] == 2 and IMAGE not in counts
@@ -168,7 +168,7 @@ def test_metadata_matches_the_file(written):
     assert info["starting_time"]["nanoseconds_since_epoch"] == min(s for _, s, _ in rows)
     assert info["duration"]["nanoseconds"] == max(s for _, s, _ in rows) - STAMP
     assert info["relative_file_paths"] == ["drive.mcap"]
-    with Bag(written) as bag:
+    with Bag(sample_bag) as bag:
         assert (bag.start_ns, bag.counts) == (STAMP, counts)
 
 
@@ -183,28 +183,28 @@ def load_bytes(frames, i):
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_frames_can_be_loaded_in_any_order_thread_and_process(written, tmp_path, storage):
+def test_frames_can_be_loaded_in_any_order_thread_and_process(sample_bag, tmp_path, storage):
     """Each thread opens the bag once, because reading a long index takes time."""
-    copy_bag(written, tmp_path / "bag", storage)
+    copy_bag(sample_bag, tmp_path / "bag", storage)
     frames = open_recording(tmp_path / "bag").frames
     expected = [frame.load().xyz.tobytes() for frame in frames]
     order = [2, 0, 1] * 4
 
-    def same(i):
+    def is_unchanged(i):
         return load_bytes(frames, i) == expected[i]
 
     with ThreadPoolExecutor(3) as pool:
-        assert all(map(same, order)) and all(pool.map(same, order))
+        assert all(map(is_unchanged, order)) and all(pool.map(is_unchanged, order))
     with ProcessPoolExecutor(2, multiprocessing.get_context("fork")) as pool:
         assert list(pool.map(partial(load_bytes, frames), order)) == [expected[i] for i in order]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Bag, "__init__", None)
-        assert all(map(same, order))
+        assert all(map(is_unchanged, order))
 
 
-def test_raw_messages_are_selected_by_topic_and_time(written):
-    rows = message_bytes(written)
-    with Bag(written) as bag:
+def test_raw_messages_are_selected_by_topic_and_time(sample_bag):
+    rows = message_bytes(sample_bag)
+    with Bag(sample_bag) as bag:
         chosen = {POINTS, TRUTH}
         assert list(bag.raw_messages(chosen)) == [row for row in rows if row[0] in chosen]
         assert list(bag.raw_messages(set())) == []
@@ -213,11 +213,11 @@ def test_raw_messages_are_selected_by_topic_and_time(written):
 
 
 @pytest.mark.parametrize("reverse", [False, True])
-def test_messages_without_chunks_are_read_one_by_one(written, tmp_path, monkeypatch, reverse):
+def test_messages_without_chunks_are_read_one_by_one(sample_bag, tmp_path, monkeypatch, reverse):
     """The preset fastwrite of `ros2 bag record` writes no chunks."""
-    path, rows = tmp_path / "fast.mcap", message_bytes(written)
+    path, rows = tmp_path / "fast.mcap", message_bytes(sample_bag)
     last = max(time for _, time, _ in rows)
-    with open(written / "drive.mcap", "rb") as stream, open(path, "wb") as out:
+    with open(sample_bag / "drive.mcap", "rb") as stream, open(path, "wb") as out:
         writer, channels = Writer(out, use_chunking=False, enable_crcs=False), {}
         writer.start("ros2")
         found = list(make_reader(stream).iter_messages())
@@ -258,13 +258,13 @@ def test_files_of_a_split_bag_are_read_in_time_order(tmp_path, storage):
     assert [stamp for _, stamp, _ in message_bytes(parts[0])] == [10, 20, 30, 40]
 
 
-def test_labels_may_come_after_their_cloud(written, tmp_path):
+def test_labels_may_come_after_their_cloud(sample_bag, tmp_path):
     with BagWriter(tmp_path / "late") as bag:
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
         bag.add_topic(TRUTH, "visualization_msgs/msg/MarkerArray")
         bag.add_topic(CAMERA_INFO, "sensor_msgs/msg/CameraInfo", LATCHED_QOS)
         bag.add_topic(EXTRINSICS, "geometry_msgs/msg/TransformStamped", LATCHED_QOS)
-        for topic, stamp, data in message_bytes(written):
+        for topic, stamp, data in message_bytes(sample_bag):
             if topic in bag.channels:
                 bag.write(topic, stamp + (topic != POINTS) * 5 * 10**7, data)
     read = list(open_recording(tmp_path / "late"))

@@ -11,7 +11,7 @@ import pytest
 from bag_samples import cloud_frame, message_bytes, same_cloud, scans
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from samples import STAMP, header, scene, write
+from samples import STAMP, make_any_header, make_scene, write_file
 
 from lidar_perception.data import bag as bag_module
 from lidar_perception.data.bag import Bag, BagWriter
@@ -36,14 +36,16 @@ def test_existing_bag_is_replaced_only_with_force(tmp_path):
     assert len(open_recording(path)) == 2
 
 
-@pytest.mark.parametrize("make", [lambda p: write(p / "bag", b"text"), lambda p: write(p / "bag/notes.txt", b"text")])
+@pytest.mark.parametrize(
+    "make", [lambda p: write_file(p / "bag", b"text"), lambda p: write_file(p / "bag/notes.txt", b"text")]
+)
 def test_force_replaces_only_bags(tmp_path, make):
     kept = make(tmp_path)
     with pytest.raises(InputError, match="is not a bag"):
         write_bag(tmp_path / "bag", scans(1), force=True)
     assert kept.read_bytes() == b"text"
     write_bag(tmp_path / "other", scans(1))
-    notes = write(tmp_path / "other/notes.txt", b"text")
+    notes = write_file(tmp_path / "other/notes.txt", b"text")
     with pytest.raises(InputError, match=r"1 other files, such as notes.txt"):
         write_bag(tmp_path / "other", scans(1), force=True)
     assert notes.read_bytes() == b"text"
@@ -70,7 +72,7 @@ def test_exception_keeps_old_bag_and_readable_partial_bag(tmp_path, force):
 
 
 def test_invalid_target_folder_is_reported(tmp_path):
-    write(tmp_path / "file", b"")
+    write_file(tmp_path / "file", b"")
     with pytest.raises(InputError, match=r"cannot create the folder .*file/bag"):
         write_bag(tmp_path / "file/bag", scans(1))
 
@@ -129,11 +131,11 @@ def test_bag_written_by_another_process_is_kept(tmp_path):
     assert len(open_recording(tmp_path / "bag")) == 2
 
 
-def test_folder_without_metadata_is_read_from_its_only_file(written, tmp_path):
-    shutil.copy(written / "drive.mcap", tmp_path)
-    assert message_bytes(tmp_path) == message_bytes(written)
-    assert message_bytes(tmp_path / "drive.mcap") == message_bytes(written)
-    shutil.copy(written / "drive.mcap", tmp_path / "second.mcap")
+def test_folder_without_metadata_is_read_from_its_only_file(sample_bag, tmp_path):
+    shutil.copy(sample_bag / "drive.mcap", tmp_path)
+    assert message_bytes(tmp_path) == message_bytes(sample_bag)
+    assert message_bytes(tmp_path / "drive.mcap") == message_bytes(sample_bag)
+    shutil.copy(sample_bag / "drive.mcap", tmp_path / "second.mcap")
     with pytest.raises(InputError, match=r"no metadata\.yaml and 2 storage files"):
         Bag(tmp_path)
 
@@ -150,14 +152,14 @@ def write_empty_mcap(path, profile):
     [
         ("missing", lambda p: None, "does not exist"),
         ("folder", lambda p: p.mkdir(), "no metadata.yaml and 0 storage files"),
-        ("cloud.bin", lambda p: write(p, b"1234"), "is not a bag"),
-        ("empty.mcap", lambda p: write(p, b""), "truncated or damaged"),
-        ("text.mcap", lambda p: write(p, b"text " * 100), "truncated or damaged"),
+        ("cloud.bin", lambda p: write_file(p, b"1234"), "is not a bag"),
+        ("empty.mcap", lambda p: write_file(p, b""), "truncated or damaged"),
+        ("text.mcap", lambda p: write_file(p, b"text " * 100), "truncated or damaged"),
         ("old.mcap", lambda p: write_empty_mcap(p, "ros1"), "MCAP file with ROS 1 messages; give the .bag"),
         ("other.mcap", lambda p: write_empty_mcap(p, ""), "without ROS 2 messages (profile '')"),
-        ("text.db3", lambda p: write(p, b"text " * 100), "truncated or damaged"),
-        ("bag", lambda p: write(p / "metadata.yaml", "text"), "truncated or damaged"),
-        ("bag", lambda p: write(p / "metadata.yaml", "a: [\n"), "truncated or damaged"),
+        ("text.db3", lambda p: write_file(p, b"text " * 100), "truncated or damaged"),
+        ("bag", lambda p: write_file(p / "metadata.yaml", "text"), "truncated or damaged"),
+        ("bag", lambda p: write_file(p / "metadata.yaml", "a: [\n"), "truncated or damaged"),
     ],
 )
 def test_invalid_bag_is_reported_in_one_line(tmp_path, name, make, words):
@@ -168,18 +170,18 @@ def test_invalid_bag_is_reported_in_one_line(tmp_path, name, make, words):
     assert "\n" not in str(error.value)
 
 
-def test_bag_without_its_storage_file_is_damaged(written, tmp_path):
-    shutil.copy(written / "metadata.yaml", tmp_path)
+def test_bag_without_its_storage_file_is_damaged(sample_bag, tmp_path):
+    shutil.copy(sample_bag / "metadata.yaml", tmp_path)
     with pytest.raises(InputError, match="truncated or damaged"):
         message_bytes(tmp_path)
 
 
 @pytest.mark.parametrize("folder", [True, False])
 @pytest.mark.no_cover
-def test_truncated_bag_is_reported(written, tmp_path, folder):
-    raw = (written / "drive.mcap").read_bytes()
+def test_truncated_bag_is_reported(sample_bag, tmp_path, folder):
+    raw = (sample_bag / "drive.mcap").read_bytes()
     if folder:
-        shutil.copy(written / "metadata.yaml", tmp_path)
+        shutil.copy(sample_bag / "metadata.yaml", tmp_path)
     path = tmp_path / "drive.mcap"
     for size in [*range(0, len(raw), 9973), *range(len(raw) - 12, len(raw))]:
         path.write_bytes(raw[:size])
@@ -208,11 +210,11 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
 @pytest.mark.no_cover
-def test_damaged_byte_is_reported_or_harmless(written, tmp_path, damage):
+def test_damaged_byte_is_reported_or_harmless(sample_bag, tmp_path, damage):
     """The damage is in the data, in a chunk header, or in the index."""
-    raw, before = (written / "drive.mcap").read_bytes(), message_bytes(written)
+    raw, before = (sample_bag / "drive.mcap").read_bytes(), message_bytes(sample_bag)
     path, reported = tmp_path / "drive.mcap", 0
-    with open(written / "drive.mcap", "rb") as stream:
+    with open(sample_bag / "drive.mcap", "rb") as stream:
         chunk = make_reader(stream).get_summary().chunk_indexes[0].chunk_start_offset
     offsets = [*range(8, len(raw), len(raw) // 40), *range(chunk, chunk + 60, 3), *range(len(raw) - 4000, len(raw), 41)]
     for at in offsets:
@@ -223,8 +225,8 @@ def test_damaged_byte_is_reported_or_harmless(written, tmp_path, damage):
     assert reported > 0.8 * len(offsets)
 
 
-def test_index_without_checksum_is_compared_with_the_data(written, tmp_path):
-    copy_bag(written, tmp_path / "plain", "mcap")
+def test_index_without_checksum_is_compared_with_the_data(sample_bag, tmp_path):
+    copy_bag(sample_bag, tmp_path / "plain", "mcap")
     source = tmp_path / "plain/plain.mcap"
     raw = source.read_bytes()
     with open(source, "rb") as stream:
@@ -234,16 +236,16 @@ def test_index_without_checksum_is_compared_with_the_data(written, tmp_path):
             "<QQQQ", index.message_start_time, index.message_end_time, index.chunk_start_offset, index.chunk_length
         )
     )
-    assert read_unless_damaged(source) == message_bytes(written)
+    assert read_unless_damaged(source) == message_bytes(sample_bag)
     path = tmp_path / "drive.mcap"
     for byte in range(at, at + 32):
         path.write_bytes(DAMAGES["flipped"](raw, byte))
         assert read_unless_damaged(path) is None
 
 
-def test_chunk_that_declares_terabytes_is_rejected(written, tmp_path):
-    raw = bytearray((written / "drive.mcap").read_bytes())
-    with open(written / "drive.mcap", "rb") as stream:
+def test_chunk_that_declares_terabytes_is_rejected(sample_bag, tmp_path):
+    raw = bytearray((sample_bag / "drive.mcap").read_bytes())
+    with open(sample_bag / "drive.mcap", "rb") as stream:
         at = make_reader(stream).get_summary().chunk_indexes[0].chunk_start_offset
     raw[at + 9 + 16 : at + 9 + 24] = struct.pack("<Q", 2**41)
     (tmp_path / "drive.mcap").write_bytes(raw)
@@ -262,15 +264,15 @@ def test_bag_without_clouds_lists_its_topics(tmp_path):
 
 
 def test_unusable_cloud_does_not_affect_others(tmp_path):
-    cloud = scene()[:, :2].copy().view([("x", "<f4"), ("y", "<f4")]).reshape(-1)
+    cloud = make_scene()[:, :2].copy().view([("x", "<f4"), ("y", "<f4")]).reshape(-1)
     write_bag(tmp_path / "bag", scans(1))
     with BagWriter(tmp_path / "mixed") as bag:
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
-        bag.write(POINTS, 1, from_array(cloud, header(make_bag_message, 1), make_bag_message))
+        bag.write(POINTS, 1, from_array(cloud, make_any_header(make_bag_message, 1), make_bag_message))
         for topic, _, data in message_bytes(tmp_path / "bag"):
             if topic == POINTS:
                 bag.write(POINTS, 2, data)
     flat, good = open_recording(tmp_path / "mixed")
     with pytest.raises(InputError, match=r"mixed, topic /points at 1 ns: .*no field 'z'"):
         flat.load()
-    assert same_cloud(scene(), good.load().xyz)
+    assert same_cloud(make_scene(), good.load().xyz)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from bag_samples import cloud_frame, message_bytes, same_cloud, scans
 from recording_samples import MADE, each_recording
-from samples import STAMP, header, object_folder, scene, walker_truth, write
+from samples import STAMP, make_any_header, make_scene, make_walker_truth, write_file, write_object_folder
 
 from lidar_perception.data import bag_frames
 from lidar_perception.data.bag import Bag, BagWriter
@@ -23,25 +23,25 @@ from lidar_perception.wire.topics import CAMERA_INFO, POINTS, TRUTH
 from msg_utils.point_cloud2 import from_array
 
 
-def same_frames(a, b):
+def are_equal_frames(a, b):
     return (a.name, a.stamp_ns, a.index) == (b.name, b.stamp_ns, b.index) and np.array_equal(a.load().xyz, b.load().xyz)
 
 
-def test_indexed_frames_equal_iterated_frames(written, tmp_path):
-    clouds = [row for row in message_bytes(written) if row[0] == POINTS]
+def test_indexed_frames_equal_iterated_frames(sample_bag, tmp_path):
+    clouds = [row for row in message_bytes(sample_bag) if row[0] == POINTS]
     with BagWriter(tmp_path / "equal") as bag:  # three with the same time, two with the same stamp
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
         bag.add_topic("/other", "sensor_msgs/msg/PointCloud2")
         for i, time in ((2, 5), (0, 7), (1, 7), (0, 7), (2, 9)):
             bag.write("/other", time, clouds[1][2])
             bag.write(POINTS, time, clouds[i][2])
-    for path, count in ((written, 3), (tmp_path / "equal", 5)):
+    for path, count in ((sample_bag, 3), (tmp_path / "equal", 5)):
         recording = open_recording(path)
         frames = list(recording)
         assert len(frames) == len(recording) == count == len({f.name for f in frames})
         for i, frame in enumerate(frames):
-            assert same_frames(frame, recording.frames[i])
-            assert same_frames(frame, recording.frames[i - count])
+            assert are_equal_frames(frame, recording.frames[i])
+            assert are_equal_frames(frame, recording.frames[i - count])
             assert (frame.truth() is None) == (recording.frames[i].truth() is None)
         assert [f.name for f in recording.frames[1:]] == [f.name for f in frames[1:]]
         for i in (count, -count - 1):
@@ -51,20 +51,20 @@ def test_indexed_frames_equal_iterated_frames(written, tmp_path):
 
 
 def find_scene(frame):
-    return next(i for i in range(3) if same_cloud(scene(i), frame.load().xyz))
+    return next(i for i in range(3) if same_cloud(make_scene(i), frame.load().xyz))
 
 
-def test_first_frame_is_read_without_scanning_the_bag(written, monkeypatch):
+def test_first_frame_is_read_without_scanning_the_bag(sample_bag, monkeypatch):
     """Scanning an hour of clouds takes minutes, and many commands need only the first one."""
     stamped = []
     monkeypatch.setattr(bag_frames.BagFrames, "_stamp", lambda self, data, time: stamped.append(time) or time)
-    frames = open_recording(written).frames
+    frames = open_recording(sample_bag).frames
     assert frames[0].index == frames[-3].index == 0 and len({*stamped}) == 1
     assert frames[1].index == 1 and len({*stamped}) == 3
 
 
-def test_indexed_frame_is_read_on_load(written, tmp_path):
-    shutil.copytree(written, tmp_path / "bag")
+def test_indexed_frame_is_read_on_load(sample_bag, tmp_path):
+    shutil.copytree(sample_bag, tmp_path / "bag")
     frame = open_recording(tmp_path / "bag").frames[1]
     os.truncate(tmp_path / "bag/drive.mcap", 100)
     with pytest.raises(InputError, match="is truncated or damaged"):
@@ -72,7 +72,7 @@ def test_indexed_frame_is_read_on_load(written, tmp_path):
 
 
 def test_contents_lists_only_recorded_content(tmp_path):
-    write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(scene(), STAMP))])
+    write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(make_scene(), STAMP))])
     assert open_recording(tmp_path / "bag").contents == set()
 
 
@@ -109,8 +109,8 @@ def test_converted_bag_equals_the_recording(tmp_path, kind):
 
 
 def test_unreadable_scan_is_skipped_and_reported(tmp_path):
-    root = object_folder(tmp_path / "kitti", count=3)
-    write(root / "training/velodyne/000001.bin", b"cut")
+    root = write_object_folder(tmp_path / "kitti", count=3)
+    write_file(root / "training/velodyne/000001.bin", b"cut")
     with pytest.raises(InputError, match=r"000001\.bin"):
         write_bag(tmp_path / "strict", open_recording(root))
     skipped = []
@@ -120,7 +120,7 @@ def test_unreadable_scan_is_skipped_and_reported(tmp_path):
 
 
 def test_scan_with_negative_stamp_is_skipped_and_reported(tmp_path):
-    scans, skipped = [Frame.of(str(t), cloud_frame(scene(), t)) for t in (-5, 7)], []
+    scans, skipped = [Frame.of(str(t), cloud_frame(make_scene(), t)) for t in (-5, 7)], []
     assert write_bag(tmp_path / "bag", scans, skipped=skipped) == 1
     assert "-5" in skipped[0] and open_recording(tmp_path / "bag").frames[0].stamp_ns == 7
 
@@ -135,10 +135,10 @@ def test_zero_stamps_are_replaced_only_if_all_are_zero(tmp_path, stamps, expecte
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
         bag.add_topic(TRUTH, "visualization_msgs/msg/MarkerArray")
         for i, stamp in enumerate(stamps):
-            head = header(make_bag_message, stamp)
+            head = make_any_header(make_bag_message, stamp)
             points = to_point_array(scans(1)[0].load())
             bag.write(POINTS, 70 + i, from_array(points, head, make_bag_message))
-            bag.write(TRUTH, 70 + i, make_truth_markers(walker_truth(), head, make_bag_message))
+            bag.write(TRUTH, 70 + i, make_truth_markers(make_walker_truth(), head, make_bag_message))
     recording = open_recording(tmp_path / "bag")
     assert [frame.stamp_ns for frame in recording] == expected
     assert [frame.stamp_ns for frame in recording.frames[:]] == expected

@@ -33,8 +33,8 @@ def no_warning():
 
 
 @pytest.fixture(scope="module")
-def rows(written):
-    return message_bytes(written)
+def messages(sample_bag):
+    return message_bytes(sample_bag)
 
 
 def write_mcap(
@@ -112,29 +112,29 @@ NO_SUMMARY = dict(
     ],
     ids=str,
 )
-def test_mcap_file_of_any_writer_is_read(written, rows, tmp_path, options):
-    with Bag(written) as bag:
-        path = write_mcap(tmp_path / "a.mcap", bag, rows, **options)
+def test_mcap_file_of_any_writer_is_read(sample_bag, messages, tmp_path, options):
+    with Bag(sample_bag) as bag:
+        path = write_mcap(tmp_path / "a.mcap", bag, messages, **options)
         with Bag(path) as other:
             assert (other.topics, other.counts) == (bag.topics, bag.counts)
             assert (other.start_ns, other.end_ns) == (bag.start_ns, bag.end_ns)
-            assert list(other.raw_messages()) == rows
-            last = rows[-1][1]
-            assert list(other.raw_messages(None, last)) == [row for row in rows if row[1] == last]
+            assert list(other.raw_messages()) == messages
+            last = messages[-1][1]
+            assert list(other.raw_messages(None, last)) == [row for row in messages if row[1] == last]
 
 
-def test_messages_inside_and_outside_chunks_are_merged(written, rows, tmp_path):
+def test_messages_inside_and_outside_chunks_are_merged(sample_bag, messages, tmp_path):
     """The MCAP specification allows both in one file."""
-    with Bag(written) as bag:
-        plain = write_mcap(tmp_path / "a", bag, rows[::2], late=True, use_chunking=False, **NO_SUMMARY)
-        chunked = write_mcap(tmp_path / "b", bag, rows[1::2], late=True, chunk_size=1, **NO_SUMMARY)
+    with Bag(sample_bag) as bag:
+        plain = write_mcap(tmp_path / "a", bag, messages[::2], late=True, use_chunking=False, **NO_SUMMARY)
+        chunked = write_mcap(tmp_path / "b", bag, messages[1::2], late=True, chunk_size=1, **NO_SUMMARY)
     body, end = plain.read_bytes()[: -37 - 13], chunked.read_bytes()
     header = 8 + 9 + int.from_bytes(end[9:17], "little")
     (tmp_path / "c.mcap").write_bytes(body + end[header:])
-    assert sorted(message_bytes(tmp_path / "c.mcap")) == sorted(rows)
+    assert sorted(message_bytes(tmp_path / "c.mcap")) == sorted(messages)
 
 
-def test_unreadable_topics_do_not_affect_others(written, rows, tmp_path):
+def test_unreadable_topics_do_not_affect_others(sample_bag, messages, tmp_path):
     with open(tmp_path / "a.mcap", "wb") as stream:
         writer = Writer(stream)
         writer.start(profile="")
@@ -144,7 +144,7 @@ def test_unreadable_topics_do_not_affect_others(written, rows, tmp_path):
             ("/log", "foxglove.Log", "protobuf", "protobuf"),
         ):
             channel = writer.register_channel(topic, encoding, writer.register_schema(kind, definition, b""))
-            for name, time, data in rows:
+            for name, time, data in messages:
                 if name == POINTS:
                     writer.add_message(channel, time, data, time)
         writer.finish()
@@ -156,8 +156,8 @@ def test_unreadable_topics_do_not_affect_others(written, rows, tmp_path):
             bag.require("/log")
 
 
-def test_topic_with_two_types_is_read_as_the_more_frequent(written, rows, tmp_path):
-    clouds = [row for row in rows if row[0] == POINTS]
+def test_topic_with_two_types_is_read_as_the_more_frequent(sample_bag, messages, tmp_path):
+    clouds = [row for row in messages if row[0] == POINTS]
     with open(tmp_path / "a.mcap", "wb") as stream:
         writer = Writer(stream)
         writer.start(profile="ros2")
@@ -207,19 +207,19 @@ def write_sqlite(path, bag, rows, schema="jazzy", mode="DELETE"):
 
 
 @pytest.mark.parametrize("schema", SCHEMAS)
-def test_sqlite_file_of_any_distribution_is_read(written, rows, tmp_path, schema):
-    with Bag(written) as bag:
-        write_sqlite(tmp_path / "a?b#c%20.db3", bag, rows, schema).close()
+def test_sqlite_file_of_any_distribution_is_read(sample_bag, messages, tmp_path, schema):
+    with Bag(sample_bag) as bag:
+        write_sqlite(tmp_path / "a?b#c%20.db3", bag, messages, schema).close()
         with Bag(tmp_path / "a?b#c%20.db3") as other:
             assert (other.topics, other.counts) == (bag.topics, bag.counts)
-            assert [*other.raw_messages()] == rows
+            assert [*other.raw_messages()] == messages
 
 
 @pytest.mark.parametrize("shm", [True, False])
-def test_sqlite_wal_is_read_from_a_read_only_folder(written, rows, tmp_path, shm):
+def test_sqlite_wal_is_read_from_a_read_only_folder(sample_bag, messages, tmp_path, shm):
     """The recorder's preset resilient leaves such a file after a crash."""
-    with Bag(written) as bag:
-        database = write_sqlite(tmp_path / "a.db3", bag, rows, mode="WAL")
+    with Bag(sample_bag) as bag:
+        database = write_sqlite(tmp_path / "a.db3", bag, messages, mode="WAL")
     (tmp_path / "bag").mkdir()
     for end in ("", "-wal", "-shm")[: 3 if shm else 2]:
         shutil.copy(tmp_path / f"a.db3{end}", tmp_path / "bag")
@@ -229,7 +229,7 @@ def test_sqlite_wal_is_read_from_a_read_only_folder(written, rows, tmp_path, shm
         file.chmod(0o444)
     (tmp_path / "bag").chmod(0o555)
     assert len(files[tmp_path / "bag/a.db3-wal"]) > 0
-    assert message_bytes(tmp_path / "bag") == message_bytes(tmp_path / "bag/a.db3") == rows
+    assert message_bytes(tmp_path / "bag") == message_bytes(tmp_path / "bag/a.db3") == messages
     assert {file: file.read_bytes() for file in (tmp_path / "bag").iterdir()} == files
     (tmp_path / "bag").chmod(0o755)
 
@@ -269,9 +269,9 @@ def update_topics(info, **values):
         lambda info: update_topics(info, type_description_hash="RIHS01_0", serialization_format=""),
     ],
 )
-def test_irrelevant_metadata_is_ignored(written, rows, tmp_path, change):
-    path = copy_with_metadata(written, tmp_path / "bag", change)
-    assert message_bytes(path) == rows
+def test_irrelevant_metadata_is_ignored(sample_bag, messages, tmp_path, change):
+    path = copy_with_metadata(sample_bag, tmp_path / "bag", change)
+    assert message_bytes(path) == messages
     assert len(open_recording(path)) == 3
 
 
@@ -287,14 +287,14 @@ def test_irrelevant_metadata_is_ignored(written, rows, tmp_path, change):
         ),
     ],
 )
-def test_qos_in_metadata_takes_precedence(written, tmp_path, text, durability, depth):
-    path = copy_with_metadata(written, tmp_path / "bag", lambda info: update_topics(info, offered_qos_profiles=text))
+def test_qos_in_metadata_takes_precedence(sample_bag, tmp_path, text, durability, depth):
+    path = copy_with_metadata(sample_bag, tmp_path / "bag", lambda info: update_topics(info, offered_qos_profiles=text))
     with Bag(path) as bag:
         (profile,) = bag.qos(POINTS)
         assert (profile.durability.name, profile.depth) == (durability, depth)
         assert profile.reliability.name == "BEST_EFFORT"
     path = copy_with_metadata(
-        written, tmp_path / "other", lambda info: update_topics(info, offered_qos_profiles="nonsense")
+        sample_bag, tmp_path / "other", lambda info: update_topics(info, offered_qos_profiles="nonsense")
     )
     with Bag(path) as bag:
         assert bag.qos(EXTRINSICS)[0].durability.name == "TRANSIENT_LOCAL"
@@ -328,32 +328,32 @@ def set_counts(info, count):
         (lambda info: info.clear(), "KeyError: 'relative_file_paths'"),
     ],
 )
-def test_wrong_metadata_is_reported_in_one_warning(written, rows, tmp_path, change, words):
-    path = copy_with_metadata(written, tmp_path / "bag", change)
+def test_wrong_metadata_is_reported_in_one_warning(sample_bag, messages, tmp_path, change, words):
+    path = copy_with_metadata(sample_bag, tmp_path / "bag", change)
     with pytest.warns(InputWarning, match=f"bag/metadata.yaml does not match the bag: .*{words}") as caught:
         recording = open_recording(path)
-        assert [len(frame.load()) for frame in recording] == [len(frame.load()) for frame in open_recording(written)]
+        assert [len(frame.load()) for frame in recording] == [len(frame.load()) for frame in open_recording(sample_bag)]
         recording.frames[2].load()
     assert len(caught) == 1 and "\n" not in str(caught[0].message)
     with pytest.warns(InputWarning), Bag(path) as bag:
-        assert (bag.start_ns, bag.end_ns) == (rows[0][1], rows[-1][1] + 1)
-        assert [*bag.raw_messages()] == rows
+        assert (bag.start_ns, bag.end_ns) == (messages[0][1], messages[-1][1] + 1)
+        assert [*bag.raw_messages()] == messages
 
 
-def test_unsupported_compression_is_reported(written, tmp_path):
+def test_unsupported_compression_is_reported(sample_bag, tmp_path):
     path = copy_with_metadata(
-        written, tmp_path / "bag", lambda info: info.update(compression_mode="FILE", compression_format="lz4")
+        sample_bag, tmp_path / "bag", lambda info: info.update(compression_mode="FILE", compression_format="lz4")
     )
     with pytest.raises(InputError, match=r"compressed by lz4, which is not supported; .*ros2 bag"):
         Bag(path)
 
 
 @pytest.mark.parametrize("text", ["text", "a: [\n", "", "\xff\x00"])
-def test_unreadable_metadata_causes_a_warning(written, rows, tmp_path, text):
-    shutil.copytree(written, tmp_path / "bag")
+def test_unreadable_metadata_causes_a_warning(sample_bag, messages, tmp_path, text):
+    shutil.copytree(sample_bag, tmp_path / "bag")
     (tmp_path / "bag/metadata.yaml").write_text(text, encoding="latin-1")
     with pytest.warns(InputWarning, match="cannot be parsed"):
-        assert message_bytes(tmp_path / "bag") == rows
+        assert message_bytes(tmp_path / "bag") == messages
 
 
 def compress(data: bytes) -> bytes:
@@ -362,8 +362,8 @@ def compress(data: bytes) -> bytes:
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("metadata", [True, False])
-def test_compressed_files_are_read(written, rows, tmp_path, storage, metadata):
-    path = copy_bag(written, tmp_path / "bag", storage)
+def test_compressed_files_are_read(sample_bag, messages, tmp_path, storage, metadata):
+    path = copy_bag(sample_bag, tmp_path / "bag", storage)
     (file,) = (file for file in path.iterdir() if file.suffix != ".yaml")
     (path / f"{file.name}.zstd").write_bytes(compress(file.read_bytes()))
     file.unlink()
@@ -371,17 +371,17 @@ def test_compressed_files_are_read(written, rows, tmp_path, storage, metadata):
     (path / "metadata.yaml").write_text(text.replace(file.name, f"{file.name}.zstd"))
     if not metadata:
         (path / "metadata.yaml").unlink()
-    assert message_bytes(path) == rows
+    assert message_bytes(path) == messages
     whole = path / f"{file.name}.zstd"
     whole.write_bytes(whole.read_bytes()[:1000])
     with pytest.raises(InputError, match=rf"{file.name}.zstd is truncated or damaged"):
         message_bytes(path)
 
 
-def test_compressed_messages_are_read(written, rows, tmp_path):
-    with Bag(written) as bag:
-        path = write_mcap(tmp_path / "a.mcap", bag, [(topic, time, compress(data)) for topic, time, data in rows])
-    assert message_bytes(path) == rows
+def test_compressed_messages_are_read(sample_bag, messages, tmp_path):
+    with Bag(sample_bag) as bag:
+        path = write_mcap(tmp_path / "a.mcap", bag, [(topic, time, compress(data)) for topic, time, data in messages])
+    assert message_bytes(path) == messages
 
 
 def write_parts(folder, stamps):
@@ -418,8 +418,8 @@ def test_files_of_a_drive_are_read_in_time_order(tmp_path, kind, stamps):
         assert [time for _, time, _ in bag.raw_messages(None, 20, 40)] == [time for time in times if 20 <= time < 40]
 
 
-def test_folder_of_ros1_bags_is_one_drive(written, tmp_path):
-    with Bag(written) as bag:
+def test_folder_of_ros1_bags_is_one_drive(sample_bag, tmp_path):
+    with Bag(sample_bag) as bag:
         clouds = [*bag.raw_messages({POINTS})]
         for i in range(3):
             with BagWriter(tmp_path / f"part{i}") as part:
@@ -427,6 +427,6 @@ def test_folder_of_ros1_bags_is_one_drive(written, tmp_path):
                 part.write(*clouds[i])
             (tmp_path / "drive").mkdir(exist_ok=True)
             as_ros1(tmp_path / f"part{i}", tmp_path / f"drive/drive_{i}.bag", "bz2")
-    recording, expected = open_recording(tmp_path / "drive"), open_recording(written)
+    recording, expected = open_recording(tmp_path / "drive"), open_recording(sample_bag)
     assert "ROS 1 bag, clouds on /points" in str(recording)
     assert [(f.stamp_ns, len(f.load())) for f in recording] == [(f.stamp_ns, len(f.load())) for f in expected]

@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 import pytest
-from samples import scene, write
+from samples import make_scene, write_file
 
 from lidar_perception.data.cloud_files import read_points
 from lidar_perception.data.open import open_recording
@@ -14,7 +14,7 @@ from lidar_perception.data.pcd import read_pcd
 from lidar_perception.data.raw_clouds import open_clouds
 from lidar_perception.types import InputError
 
-CLOUD = scene(0)[:60].astype(np.float32)
+CLOUD = make_scene(0)[:60].astype(np.float32)
 PROPERTIES = {"f4": "float", "f8": "float64", "u1": "uchar", "i2": "int16"}
 
 
@@ -23,54 +23,65 @@ def load(path):
     return frame.load()
 
 
-def header(fields="x y z intensity", types="F F F F", sizes="4 4 4 4", data="binary", more=""):
+def make_pcd_header(fields="x y z intensity", types="F F F F", sizes="4 4 4 4", data="binary", more=""):
     return (
         f"# .PCD v0.7\nVERSION 0.7\nFIELDS {fields}\nSIZE {sizes}\nTYPE {types}\n{more}"
         f"WIDTH {len(CLOUD)}\nHEIGHT 1\nPOINTS {len(CLOUD)}\nDATA {data}\n"
     )
 
 
-def text(columns=CLOUD, form="{:.6f}"):
+def format_points(columns=CLOUD, form="{:.6f}"):
     return "\n".join(" ".join(form.format(v) for v in row) for row in columns.tolist())
 
 
-def padded(count0):
+def make_padded_pcd(count0):
     """Return a PCD file with padding and an empty field."""
     kind = np.dtype([("xyz", "<f4", 3), ("pad", "V4"), ("intensity", "<f4"), ("end", "V2")])
     made = np.zeros(len(CLOUD), kind)
     made["xyz"], made["intensity"] = CLOUD[:, :3], CLOUD[:, 3]
     return (
-        header(f"x y z _ intensity {count0} _", "F F F U F U U", "4 4 4 1 4 1 1", more="COUNT 1 1 1 4 1 0 2\n").encode()
+        make_pcd_header(
+            f"x y z _ intensity {count0} _", "F F F U F U U", "4 4 4 1 4 1 1", more="COUNT 1 1 1 4 1 0 2\n"
+        ).encode()
         + made.tobytes()
     )
 
 
 PCD = {
-    "upper-case suffix": ("one.PCD", header().encode() + CLOUD.tobytes()),
+    "upper-case suffix": ("one.PCD", make_pcd_header().encode() + CLOUD.tobytes()),
     "upper-case fields": (
         "one.pcd",
-        header("X Y Z Intensity", sizes="8 8 8 8").encode() + CLOUD.astype("<f8").tobytes(),
+        make_pcd_header("X Y Z Intensity", sizes="8 8 8 8").encode() + CLOUD.astype("<f8").tobytes(),
     ),
-    "other names": ("one.pcd", header("x y z scalar_Reflectance").encode() + CLOUD.tobytes()),
-    "COLUMNS": ("one.pcd", (header(data="ascii").replace("FIELDS", "COLUMNS").replace("0.7", ".5") + text()).encode()),
+    "other names": ("one.pcd", make_pcd_header("x y z scalar_Reflectance").encode() + CLOUD.tobytes()),
+    "COLUMNS": (
+        "one.pcd",
+        (make_pcd_header(data="ascii").replace("FIELDS", "COLUMNS").replace("0.7", ".5") + format_points()).encode(),
+    ),
     "no TYPE and SIZE": (
         "one.pcd",
         (
-            "\n".join(line for line in header(data="ascii").split("\n") if line[:4] not in ("TYPE", "SIZE")) + text()
+            "\n".join(line for line in make_pcd_header(data="ascii").split("\n") if line[:4] not in ("TYPE", "SIZE"))
+            + format_points()
         ).encode(),
     ),
-    "CRLF": ("one.pcd", (header(data="ascii") + text()).replace("\n", "\r\n").encode()),
-    "CRLF in the header": ("one.pcd", header().replace("\n", "\r\n").encode() + CLOUD.tobytes()),
-    "byte order mark": ("one.pcd", b"\xef\xbb\xbf" + header(data="ASCII", types="f f f f").encode() + text().encode()),
-    "COUNT 0": ("one.pcd", padded("ring")),
-    "COUNT 0 of padding": ("one.pcd", padded("_")),
+    "CRLF": ("one.pcd", (make_pcd_header(data="ascii") + format_points()).replace("\n", "\r\n").encode()),
+    "CRLF in the header": ("one.pcd", make_pcd_header().replace("\n", "\r\n").encode() + CLOUD.tobytes()),
+    "byte order mark": (
+        "one.pcd",
+        b"\xef\xbb\xbf" + make_pcd_header(data="ASCII", types="f f f f").encode() + format_points().encode(),
+    ),
+    "COUNT 0": ("one.pcd", make_padded_pcd("ring")),
+    "COUNT 0 of padding": ("one.pcd", make_padded_pcd("_")),
     "stored, not compressed": (
         "one.pcd",
-        header(data="binary_compressed").encode() + struct.pack("<II", CLOUD.nbytes, CLOUD.nbytes) + CLOUD.T.tobytes(),
+        make_pcd_header(data="binary_compressed").encode()
+        + struct.pack("<II", CLOUD.nbytes, CLOUD.nbytes)
+        + CLOUD.T.tobytes(),
     ),
     "fractions of an integer field": (
         "one.pcd",
-        (header(types="F F F U", sizes="4 4 4 1", data="ascii") + text()).encode(),
+        (make_pcd_header(types="F F F U", sizes="4 4 4 1", data="ascii") + format_points()).encode(),
     ),
 }
 
@@ -78,7 +89,7 @@ PCD = {
 @pytest.mark.parametrize("case", PCD)
 def test_pcd_variants_are_read(tmp_path, case):
     name, content = PCD[case]
-    write(tmp_path / name, content)
+    write_file(tmp_path / name, content)
     for frame in (load(tmp_path / name), load(tmp_path)):
         np.testing.assert_allclose(frame.xyz, CLOUD[:, :3], atol=1e-6)
         np.testing.assert_allclose(frame.intensity, CLOUD[:, 3], atol=1e-6)
@@ -87,12 +98,14 @@ def test_pcd_variants_are_read(tmp_path, case):
 
 def test_integers_with_decimal_point_keep_their_type(tmp_path):
     whole = np.column_stack([CLOUD[:, :3], np.arange(len(CLOUD))])
-    path = write(tmp_path / "one.pcd", header(types="F F F U", sizes="4 4 4 1", data="ascii") + text(whole))
+    path = write_file(
+        tmp_path / "one.pcd", make_pcd_header(types="F F F U", sizes="4 4 4 1", data="ascii") + format_points(whole)
+    )
     assert read_pcd(path).dtype["intensity"] == np.uint8
     assert read_pcd(path)["intensity"].tolist() == list(range(len(CLOUD)))
 
 
-def ply(form, names=("x", "y", "z", "intensity"), kinds=("f4",) * 4, before="", skipped=b""):
+def make_ply(form, names=("x", "y", "z", "intensity"), kinds=("f4",) * 4, before="", skipped=b""):
     order = ">" if "big" in form else "<"
     head = f"ply\nformat {form} 1.0\ncomment made by a test\n{before}element vertex {len(CLOUD)}\n"
     head += "".join(f"property {PROPERTIES[kind]} {name}\n" for name, kind in zip(names, kinds))
@@ -100,7 +113,7 @@ def ply(form, names=("x", "y", "z", "intensity"), kinds=("f4",) * 4, before="", 
     cloud = np.empty(len(CLOUD), [(name, order + kind) for name, kind in zip(names, kinds)])
     for name, values in zip(names, CLOUD.T):
         cloud[name] = values
-    body = text().encode() if form == "ascii" else cloud.tobytes()
+    body = format_points().encode() if form == "ascii" else cloud.tobytes()
     return head.encode() + skipped + body + b"\n3 0 1 2\n"
 
 
@@ -114,7 +127,7 @@ def ply(form, names=("x", "y", "z", "intensity"), kinds=("f4",) * 4, before="", 
     ],
 )
 def test_ply_formats_are_read(tmp_path, form, names, kinds):
-    frame = load(write(tmp_path / "one.PLY", ply(form, names, kinds)))
+    frame = load(write_file(tmp_path / "one.PLY", make_ply(form, names, kinds)))
     np.testing.assert_allclose(frame.xyz, CLOUD[:, :3], atol=1e-6)
     np.testing.assert_allclose(frame.intensity, CLOUD[:, 3], atol=1e-6)
 
@@ -122,7 +135,7 @@ def test_ply_formats_are_read(tmp_path, form, names, kinds):
 def test_ply_elements_before_the_vertices_are_skipped(tmp_path):
     before = "element camera 2\nproperty float a\nproperty uchar b\n"
     for form, skipped in (("ascii", b"1.5 2\n3.5 4\n"), ("binary_little_endian", bytes(10))):
-        path = write(tmp_path / "one.ply", ply(form, before=before, skipped=skipped))
+        path = write_file(tmp_path / "one.ply", make_ply(form, before=before, skipped=skipped))
         np.testing.assert_allclose(load(path).xyz, CLOUD[:, :3], atol=1e-6)
 
 
@@ -134,17 +147,17 @@ def test_ply_elements_before_the_vertices_are_skipped(tmp_path):
         (b"ply\nformat ascii 1.0\nend_header\n", "element vertex is missing"),
         (b"ply\nelement vertex 1\nproperty float x\nend_header\n1\n", "line format is missing"),
         (b"ply\nformat odd 1.0\nend_header\n", "odd"),
-        (ply("ascii")[:900], "it is truncated"),
-        (ply("binary_big_endian")[:900], "it is truncated"),
+        (make_ply("ascii")[:900], "it is truncated"),
+        (make_ply("binary_big_endian")[:900], "it is truncated"),
         (
             b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n1\n",
             "x of vertex elements is a list",
         ),
-        (ply("ascii", ("x", "y", "w", "v")), "has no field z"),
+        (make_ply("ascii", ("x", "y", "w", "v")), "has no field z"),
     ],
 )
 def test_invalid_ply_file_is_reported(tmp_path, content, words):
-    write(tmp_path / "one.ply", content)
+    write_file(tmp_path / "one.ply", content)
     with pytest.raises(InputError, match=rf"one\.ply .*{words}") as error:
         load(tmp_path)
     assert "\n" not in str(error.value)
@@ -174,12 +187,12 @@ def test_npy_files_are_read(tmp_path, array, intensity):
         lambda p: np.save(p, CLOUD.T),
         lambda p: np.save(p, CLOUD.astype(np.int32)),
         lambda p: np.save(p, np.array([{}]), allow_pickle=True),
-        lambda p: write(p, b"\x93NUMPY"),
+        lambda p: write_file(p, b"\x93NUMPY"),
         lambda p: np.save(p, np.zeros((5, 2), np.float32)),
-        lambda p: write(p, b""),
-        lambda p: (np.save(p, CLOUD), write(p, p.read_bytes().replace(b"(60, 4)", b"(60,(60,"))),
-        lambda p: (np.save(p, CLOUD), write(p, p.read_bytes().replace(b"(60, 4)", b"(9**99,"))),
-        lambda p: (np.save(p, CLOUD), write(p, p.read_bytes().replace(b"(60, 4)", b"(60, 5)"))),
+        lambda p: write_file(p, b""),
+        lambda p: (np.save(p, CLOUD), write_file(p, p.read_bytes().replace(b"(60, 4)", b"(60,(60,"))),
+        lambda p: (np.save(p, CLOUD), write_file(p, p.read_bytes().replace(b"(60, 4)", b"(9**99,"))),
+        lambda p: (np.save(p, CLOUD), write_file(p, p.read_bytes().replace(b"(60, 4)", b"(60, 5)"))),
     ],
 )
 def test_invalid_npy_file_is_reported(tmp_path, make):
@@ -224,7 +237,7 @@ FIRST = 1_741_286_117
 )
 def test_times_in_file_names_need_no_leading_zeros(tmp_path, names, expected):
     for name in names:
-        write(tmp_path / f"{name}.BIN", CLOUD.tobytes())
+        write_file(tmp_path / f"{name}.BIN", CLOUD.tobytes())
     recording = open_recording(tmp_path)
     assert [f.stamp_ns - FIRST * 10**9 for f in recording] == sorted(expected)
     assert [f.name for f in recording] == names and recording.has_times
@@ -247,7 +260,7 @@ def test_times_in_file_names_need_no_leading_zeros(tmp_path, names, expected):
     ],
 )
 def test_unsupported_formats_are_reported_with_a_converter(tmp_path, file, words):
-    path = write(tmp_path / file, b"LASF")
+    path = write_file(tmp_path / file, b"LASF")
     for given in (path, tmp_path):
         for opener in (open_recording, open_clouds):
             with pytest.raises(InputError, match=words) as error:

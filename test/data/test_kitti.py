@@ -4,8 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from kitti_samples import LAYOUTS, each_layout, raw_folder, tracking_folder
-from samples import CALIBRATION, INTRINSICS, LIDAR_TO_CAMERA, calibration_text, object_folder, png_header, scene, write
+from kitti_samples import LAYOUTS, each_layout, write_raw_folder, write_tracking_folder
+from samples import (
+    CALIBRATION,
+    INTRINSICS,
+    LIDAR_TO_CAMERA,
+    make_calibration_text,
+    make_png_header,
+    make_scene,
+    write_file,
+    write_object_folder,
+)
 
 from lidar_perception.data.kitti.calibration import IMAGE_SIZES, read_calibration
 from lidar_perception.data.kitti.folder import START_NS, read_velodyne
@@ -17,7 +26,7 @@ def test_scans_are_read_unchanged(tmp_path, layout, count):
     frames = open_recording(LAYOUTS[layout](tmp_path)).frames
     assert len(frames) == count
     for frame in frames:
-        expected = scene(int(frame.points.stem))
+        expected = make_scene(int(frame.points.stem))
         assert np.array_equal(read_velodyne(frame.points), expected)
         assert np.array_equal(frame.load().xyz, expected[:, :3])
         assert np.array_equal(frame.load().intensity, expected[:, 3])
@@ -42,9 +51,9 @@ def test_frames_have_ascending_stamps_and_unique_names(tmp_path, layout):
 
 
 def test_object_and_tracking_frames_are_stamped_at_10_hz(tmp_path):
-    frames = open_recording(object_folder(tmp_path / "o", count=3))
+    frames = open_recording(write_object_folder(tmp_path / "o", count=3))
     assert [f.stamp_ns - START_NS for f in frames] == [0, 10**8, 2 * 10**8]
-    frames = open_recording(tracking_folder(tmp_path / "t")).frames
+    frames = open_recording(write_tracking_folder(tmp_path / "t")).frames
     first, second = ([f for f in frames if f.name.startswith(s)] for s in ("0000/", "0007/"))
     assert [f.stamp_ns - first[0].stamp_ns for f in first] == [0, 10**8, 2 * 10**8]
     assert [f.stamp_ns - second[0].stamp_ns for f in second] == [0, 10**8]
@@ -52,14 +61,18 @@ def test_object_and_tracking_frames_are_stamped_at_10_hz(tmp_path):
 
 
 def test_missing_frame_leaves_a_gap_in_time(tmp_path):
-    root = tracking_folder(tmp_path)
+    root = write_tracking_folder(tmp_path)
     (root / "training/velodyne/0000/000001.bin").unlink()
     assert [f.stamp_ns - START_NS for f in open_recording(root).frames[:2]] == [0, 2 * 10**8]
 
 
 def test_raw_stamps_have_nanosecond_resolution(tmp_path):
     second = 1317042145 * 10**9  # date -u -d '2011-09-26 13:02:25' +%s
-    assert [f.stamp_ns - second for f in open_recording(raw_folder(tmp_path))] == [594360375, 700000000, 1000000001]
+    assert [f.stamp_ns - second for f in open_recording(write_raw_folder(tmp_path))] == [
+        594360375,
+        700000000,
+        1000000001,
+    ]
 
 
 @pytest.mark.parametrize("inner", ["", "training", "2011_09_26", "2011_09_26/2011_09_26_drive_0001_sync"])
@@ -71,16 +84,16 @@ def test_outer_and_inner_folders_are_the_same_recording(tmp_path, inner):
 
 
 def test_full_scan_is_preferred_to_reduced_one(tmp_path):
-    root = object_folder(tmp_path)
+    root = write_object_folder(tmp_path)
     for i in (1, 2):
-        write(root / f"training/velodyne_reduced/{i:06}.bin", scene(i)[:50].tobytes())
-    assert [len(f.load()) for f in open_recording(root)] == [len(scene()), len(scene()), 50]
+        write_file(root / f"training/velodyne_reduced/{i:06}.bin", make_scene(i)[:50].tobytes())
+    assert [len(f.load()) for f in open_recording(root)] == [len(make_scene()), len(make_scene()), 50]
 
 
 def test_unusable_returns_are_dropped(tmp_path):
-    root = object_folder(tmp_path)
+    root = write_object_folder(tmp_path)
     cloud = np.array([[1, 2, 3, 0.5], [0, 0, 0, 0.1], [np.nan, 1, 1, 0.2], [4, 5, 6, 0.7]], "f4")
-    write(root / "training/velodyne/000000.bin", cloud.tobytes())
+    write_file(root / "training/velodyne/000000.bin", cloud.tobytes())
     frame = open_recording(root).frames[0]
     assert frame.load().xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
     assert frame.load().intensity.tolist() == [0.5, np.float32(0.7)]
@@ -88,27 +101,27 @@ def test_unusable_returns_are_dropped(tmp_path):
 
 
 def test_empty_scan_is_read(tmp_path):
-    assert read_velodyne(write(tmp_path / "empty.bin", b"")).shape == (0, 4)
+    assert read_velodyne(write_file(tmp_path / "empty.bin", b"")).shape == (0, 4)
 
 
 def test_image_size_is_read_from_the_png(tmp_path):
-    root = object_folder(tmp_path)
-    write(root / "training/image_2/000001.png", png_header(640, 480))
+    root = write_object_folder(tmp_path)
+    write_file(root / "training/image_2/000001.png", make_png_header(640, 480))
     sizes = [(f.calibration().width, f.calibration().height) for f in open_recording(root)]
     assert sizes == [(1242, 375), (640, 480)]
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89PNG", b"JFIF" * 10])
 def test_invalid_png_does_not_change_the_image_size(tmp_path, content):
-    path, image = write(tmp_path / "c.txt", calibration_text()), write(tmp_path / "i.png", content)
+    path, image = write_file(tmp_path / "c.txt", make_calibration_text()), write_file(tmp_path / "i.png", content)
     calibration = read_calibration(path, image)
     assert (calibration.width, calibration.height) == (1242, 375)
 
 
 @pytest.mark.parametrize("focal, size", [*IMAGE_SIZES.items(), (1000.0, (1242, 375))])
 def test_image_size_follows_from_focal_length_without_image(tmp_path, focal, size):
-    text = calibration_text().replace("721.5377", str(focal))
-    calibration = read_calibration(write(tmp_path / "c.txt", text))
+    text = make_calibration_text().replace("721.5377", str(focal))
+    calibration = read_calibration(write_file(tmp_path / "c.txt", text))
     assert (calibration.width, calibration.height) == size
 
 

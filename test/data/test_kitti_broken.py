@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from kitti_samples import LAYOUTS, TRACKING_LABELS, TRACKLETS, raw_folder
-from samples import LABELS, calibration_text, object_folder, write
+from kitti_samples import LAYOUTS, TRACKING_LABELS, TRACKLETS, write_raw_folder
+from samples import LABELS, make_calibration_text, write_file, write_object_folder
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.types import InputError
@@ -15,12 +15,12 @@ INVALID_FILES = {  # invalid file -> its content (None: removed), words of the e
         (None, "cannot read"),
         (b"\xff\xfe\x00", "cannot read"),
         ("", "no P2"),
-        (calibration_text().replace("P2", "P3"), "no P2 with 12 finite numbers"),
-        (calibration_text().replace("R0_rect", "x"), "no R0_rect with 9 finite numbers"),
-        (calibration_text().replace("Tr_velo_to_cam", "x"), "no Tr_velo_to_cam with 12 finite"),
-        (calibration_text().replace("P2: ", "P2: 1 "), "no P2 with 12 finite numbers"),
-        (calibration_text().replace("P2: 721.5377", "P2: wide"), "no P2 with 12 finite numbers"),
-        (calibration_text().replace("P2: 721.5377", "P2: nan"), "no P2 with 12 finite numbers"),
+        (make_calibration_text().replace("P2", "P3"), "no P2 with 12 finite numbers"),
+        (make_calibration_text().replace("R0_rect", "x"), "no R0_rect with 9 finite numbers"),
+        (make_calibration_text().replace("Tr_velo_to_cam", "x"), "no Tr_velo_to_cam with 12 finite"),
+        (make_calibration_text().replace("P2: ", "P2: 1 "), "no P2 with 12 finite numbers"),
+        (make_calibration_text().replace("P2: 721.5377", "P2: wide"), "no P2 with 12 finite numbers"),
+        (make_calibration_text().replace("P2: 721.5377", "P2: nan"), "no P2 with 12 finite numbers"),
     ],
     "label_2/000000.txt": [
         (LABELS + "Car 0 0 0\n", ":4 is not a KITTI label"),
@@ -30,7 +30,7 @@ INVALID_FILES = {  # invalid file -> its content (None: removed), words of the e
 }
 
 
-def read(frame):
+def read_frame(frame):
     """Read all parts of a frame."""
     return frame.load(), frame.truth(), frame.calibration()
 
@@ -40,17 +40,17 @@ def read(frame):
     [(file, content, words) for file, cases in INVALID_FILES.items() for content, words in cases],
 )
 def test_invalid_file_affects_only_its_frame(tmp_path, file, content, words):
-    root = object_folder(tmp_path)
+    root = write_object_folder(tmp_path)
     path = root / "training" / file
     path.unlink()
     if content is not None:
-        write(path, content)
+        write_file(path, content)
     broken, good = open_recording(root)
     with pytest.raises(InputError) as error:
-        read(broken)
+        read_frame(broken)
     assert str(path) in str(error.value) and words in str(error.value)
     assert "\n" not in str(error.value)
-    read(good)
+    read_frame(good)
     assert good.name == "000001"
 
 
@@ -75,18 +75,18 @@ def test_invalid_file_affects_only_its_frame(tmp_path, file, content, words):
 )
 def test_invalid_file_of_a_sequence_is_reported(tmp_path, layout, file, content, words):
     root = LAYOUTS[layout](tmp_path)
-    write(root / file, content)
+    write_file(root / file, content)
     with pytest.raises(InputError) as error:
-        read(open_recording(root).frames[0])
+        read_frame(open_recording(root).frames[0])
     assert str(root / file) in str(error.value) and words in str(error.value)
 
 
 @pytest.mark.parametrize("text", [None, "yesterday\n" * 3, "2011-09-26 13:02:25.5\n"])
 def test_invalid_time_stamps_are_reported(tmp_path, text):
-    path = next(raw_folder(tmp_path).rglob("timestamps.txt"))
+    path = next(write_raw_folder(tmp_path).rglob("timestamps.txt"))
     path.unlink()
     if text is not None:
-        write(path, text)
+        write_file(path, text)
     with pytest.raises(InputError, match=r"velodyne_points/timestamps\.txt"):
         open_recording(tmp_path)
 
@@ -100,6 +100,6 @@ def test_invalid_time_stamps_are_reported(tmp_path, text):
 )
 def test_scan_without_number_is_reported(tmp_path, layout, scan):
     root = LAYOUTS[layout](tmp_path)
-    write(root / scan, b"")
+    write_file(root / scan, b"")
     with pytest.raises(InputError, match=r"notes\.bin"):
         open_recording(root)

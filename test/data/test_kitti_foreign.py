@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from kitti_samples import TRACKLETS, raw_folder, tracking_folder
-from samples import LABELS, object_folder, scene, write
+from kitti_samples import TRACKLETS, write_raw_folder, write_tracking_folder
+from samples import LABELS, make_scene, write_file, write_object_folder
 
 from lidar_perception.data.kitti.labels import parse_label, read_tracklets
 from lidar_perception.data.open import open_recording
@@ -45,7 +45,7 @@ def encode_for_windows(text):
     return b"\xef\xbb\xbf" + text.replace("\n", " \t\r\n").encode() + b"\r\n\r\n"
 
 
-@pytest.mark.parametrize("make", [object_folder, tracking_folder, raw_folder])
+@pytest.mark.parametrize("make", [write_object_folder, write_tracking_folder, write_raw_folder])
 def test_files_of_windows_editors_are_read(tmp_path, make):
     expected = list(open_recording(make(tmp_path / "plain")))
     root = make(tmp_path / "windows")
@@ -58,13 +58,13 @@ def test_files_of_windows_editors_are_read(tmp_path, make):
         assert truth is other is None or (
             truth.labels == other.labels and np.array_equal(truth.boxes, other.boxes) and truth.notes == other.notes
         )
-    split = write(tmp_path / "split.txt", encode_for_windows(f"{expected[-1].name}\n"))
+    split = write_file(tmp_path / "split.txt", encode_for_windows(f"{expected[-1].name}\n"))
     assert [f.name for f in open_recording(root, split=split)] == [expected[-1].name]
 
 
 def test_tracking_labels_without_scan_are_listed(tmp_path):
-    root = tracking_folder(tmp_path)
-    write(root / "training/label_02/0003.txt", "7 1 " + CAR + "\n7 2 " + CAR + "\n")
+    root = write_tracking_folder(tmp_path)
+    write_file(root / "training/label_02/0003.txt", "7 1 " + CAR + "\n7 2 " + CAR + "\n")
     (root / "training/velodyne/0000/000002.bin").unlink()
     recording = open_recording(root)
     assert [name for name, _ in recording.missing_scans] == ["0000/000002", "0003/000007"]
@@ -81,13 +81,13 @@ STAMPS = [f"2011-09-26 13:04:32.{i}00000000" for i in range(9)]
 START_NS = 1_317_042_272 * 10**9
 
 
-def raw_scans(root, numbers, lines):
-    raw_folder(root)
+def write_raw_scans(root, numbers, lines):
+    write_raw_folder(root)
     for path in (root / DRIVE / "velodyne_points/data").iterdir():
         path.unlink()
     for number in numbers:
-        write(root / DRIVE / f"velodyne_points/data/{number:010}.bin", scene(number).tobytes())
-    write(root / DRIVE / "velodyne_points/timestamps.txt", "\n".join(lines) + "\n")
+        write_file(root / DRIVE / f"velodyne_points/data/{number:010}.bin", make_scene(number).tobytes())
+    write_file(root / DRIVE / "velodyne_points/timestamps.txt", "\n".join(lines) + "\n")
     return root
 
 
@@ -96,7 +96,7 @@ def test_blank_time_stamps_are_those_of_missing_scans(tmp_path, missing):
     numbers = [i for i in range(9) if i not in missing]
     blank = ["" if i in missing else line for i, line in enumerate(STAMPS)]
     for lines in (blank, STAMPS, [line for line in blank if line]):
-        recording = open_recording(raw_scans(tmp_path, numbers, lines))
+        recording = open_recording(write_raw_scans(tmp_path, numbers, lines))
         assert [frame.index for frame in recording] == numbers
         assert [frame.stamp_ns for frame in recording] == [START_NS + i * 10**8 for i in numbers]
 
@@ -104,21 +104,21 @@ def test_blank_time_stamps_are_those_of_missing_scans(tmp_path, missing):
 def test_scan_without_time_stamp_is_reported(tmp_path):
     for lines in (STAMPS[:4] + [""] + STAMPS[5:], STAMPS[:3]):
         with pytest.raises(InputError, match=r"timestamps.txt has no line for scan 4"):
-            open_recording(raw_scans(tmp_path, (0, 1, 4, 5), lines))
+            open_recording(write_raw_scans(tmp_path, (0, 1, 4, 5), lines))
 
 
 def write_exported_drive(root, names=("0000000000", "0000000001", "0000000002"), frame_list=""):
     """Write a drive as CVAT and Datumaro export it: .pcd files and user-defined class names
     only."""
     for i, name in enumerate(names):
-        cloud = scene(i)[:40]
-        write(
+        cloud = make_scene(i)[:40]
+        write_file(
             root / f"velodyne_points/data/{name}.pcd",
             b"FIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nPOINTS 40\nDATA binary\n" + cloud.tobytes(),
         )
-    write(root / "tracklet_labels.xml", TRACKLETS.replace("Pedestrian", "pedestrian"))
+    write_file(root / "tracklet_labels.xml", TRACKLETS.replace("Pedestrian", "pedestrian"))
     if frame_list:
-        write(root / "frame_list.txt", frame_list)
+        write_file(root / "frame_list.txt", frame_list)
     return root
 
 
@@ -142,12 +142,12 @@ def test_scan_missing_in_frame_list_is_reported(tmp_path):
     root = write_exported_drive(tmp_path, ("a", "b", "c"), "0 a\n1 b\n")
     with pytest.raises(InputError, match=r"frame_list.txt does not list c\.pcd"):
         open_recording(root)
-    write(root / "frame_list.txt", "first a\n")
+    write_file(root / "frame_list.txt", "first a\n")
     with pytest.raises(InputError, match=r"frame_list.txt has a line that is not NUMBER NAME"):
         open_recording(root)
 
 
-def tracklet(name, poses, size=(1.5, 1.6, 3.9), more=""):
+def format_tracklet(name, poses, size=(1.5, 1.6, 3.9), more=""):
     h, w, length = size
     return (
         f"<item><objectType>{name}</objectType><h>{h}</h><w>{w}</w><l>{length}</l>{more}<poses>"
@@ -157,14 +157,14 @@ def tracklet(name, poses, size=(1.5, 1.6, 3.9), more=""):
 
 
 def test_tracklets_of_other_tools_keep_their_class_names(tmp_path):
-    path = write(
+    path = write_file(
         tmp_path / "tracklet_labels.xml",
         "<boost_serialization><tracklets>"
         + "".join(
             (
-                tracklet("CAR", [(12, "<state>2</state><occlusion/>"), (11, "")]),
-                tracklet(" bus ", [(9, "<truncation>2</truncation>")], more="<first_frame>1</first_frame>"),
-                tracklet(
+                format_tracklet("CAR", [(12, "<state>2</state><occlusion/>"), (11, "")]),
+                format_tracklet(" bus ", [(9, "<truncation>2</truncation>")], more="<first_frame>1</first_frame>"),
+                format_tracklet(
                     "car",
                     [
                         (5, ""),
@@ -175,7 +175,7 @@ def test_tracklets_of_other_tools_keep_their_class_names(tmp_path):
                         ),
                     ],
                 ),
-                tracklet("Van", [(5, "")], size=(0, 1, 2)),
+                format_tracklet("Van", [(5, "")], size=(0, 1, 2)),
             )
         )
         + "</tracklets></boost_serialization>",
@@ -188,6 +188,6 @@ def test_tracklets_of_other_tools_keep_their_class_names(tmp_path):
 
 
 def test_unknown_object_class_keeps_its_name(tmp_path):
-    root = object_folder(tmp_path, LABELS + CAR.replace("Car", "e-scooter") + "\n")
+    root = write_object_folder(tmp_path, LABELS + CAR.replace("Car", "e-scooter") + "\n")
     truth = open_recording(root).frames[0].truth()
     assert truth.labels[-1] == "Misc" and truth.extras[-1]["class_name"] == "e-scooter"

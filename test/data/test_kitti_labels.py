@@ -5,8 +5,16 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from kitti_samples import LAYOUTS, each_layout, format_truth, raw_folder, same, through_markers, tracking_folder
-from samples import AXES, LABELS, LIDAR_TO_CAMERA, object_folder, write
+from kitti_samples import (
+    LAYOUTS,
+    are_equal_truths,
+    each_layout,
+    format_truth,
+    pass_through_markers,
+    write_raw_folder,
+    write_tracking_folder,
+)
+from samples import AXES, LABELS, LIDAR_TO_CAMERA, write_file, write_object_folder
 
 from lidar_perception.data.kitti.labels import parse_label, to_ground_truth, to_labels
 from lidar_perception.data.open import open_recording
@@ -14,41 +22,41 @@ from lidar_perception.geometry import box_corners
 from lidar_perception.types import CLASSES, GroundTruth
 
 
-def hundredths(low: int, high: int):
+def draw_decimals(low: int, high: int):
     return st.integers(low, high).map(lambda n: f"{n / 100:.2f}")
 
 
 @st.composite
-def label_lines(draw) -> str:
+def draw_label_line(draw) -> str:
     if draw(st.booleans()):
-        bbox = [draw(hundredths(0, 120000)) for _ in range(4)]
+        bbox = [draw(draw_decimals(0, 120000)) for _ in range(4)]
         return f"DontCare -1 -1 -10 {' '.join(bbox)} -1 -1 -1 -1000 -1000 -1000 -10"
     return " ".join(
         [
             draw(st.sampled_from([*CLASSES[:-1], "Unicorn"])),
-            draw(hundredths(0, 100)),
+            draw(draw_decimals(0, 100)),
             str(draw(st.integers(0, 3))),
-            draw(hundredths(-314, 314)),
-            *(draw(hundredths(0, 120000)) for _ in range(4)),
-            *(draw(hundredths(30, 2000)) for _ in range(3)),
-            draw(hundredths(-5000, 5000)),
-            draw(hundredths(-300, 500)),
-            draw(hundredths(100, 8000)),
-            draw(hundredths(-314, 314)),
+            draw(draw_decimals(-314, 314)),
+            *(draw(draw_decimals(0, 120000)) for _ in range(4)),
+            *(draw(draw_decimals(30, 2000)) for _ in range(3)),
+            draw(draw_decimals(-5000, 5000)),
+            draw(draw_decimals(-300, 500)),
+            draw(draw_decimals(100, 8000)),
+            draw(draw_decimals(-314, 314)),
         ]
     )
 
 
-@given(st.lists(label_lines(), max_size=6))
+@given(st.lists(draw_label_line(), max_size=6))
 def test_labels_survive_conversion_to_markers_and_back(lines):
     truth = to_ground_truth([parse_label(line) for line in lines], LIDAR_TO_CAMERA)
-    received = through_markers(truth)
-    assert same(received, truth)
+    received = pass_through_markers(truth)
+    assert are_equal_truths(received, truth)
     expected = sorted(lines, key=lambda line: line.startswith("DontCare"))  # regions come last
     assert format_truth(truth) == format_truth(received) == expected
 
 
-@given(label_lines().filter(lambda line: not line.startswith(("DontCare", "Unicorn"))))
+@given(draw_label_line().filter(lambda line: not line.startswith(("DontCare", "Unicorn"))))
 def test_computed_label_matches_its_box(line):
     label = parse_label(line)
     truth = to_ground_truth([label], LIDAR_TO_CAMERA)
@@ -62,7 +70,7 @@ def test_computed_label_matches_its_box(line):
     assert -np.pi <= again["alpha"] <= np.pi
 
 
-@given(label_lines().filter(lambda line: not line.startswith("DontCare")))
+@given(draw_label_line().filter(lambda line: not line.startswith("DontCare")))
 def test_box_corners_match_the_development_kit(line):
     """Compare with computeBox3D.m, for a level camera."""
     label = parse_label(line)
@@ -81,32 +89,32 @@ def test_box_corners_match_the_development_kit(line):
 
 
 def test_object_labels_belong_to_their_frame(tmp_path):
-    root = object_folder(tmp_path)
-    write(root / "training/label_2/000001.txt", "")
+    root = write_object_folder(tmp_path)
+    write_file(root / "training/label_2/000001.txt", "")
     first, second = open_recording(root).frames
     assert format_truth(first.truth()) == LABELS.splitlines()
     assert len(second.truth()) == 0 and second.truth().notes == ()
 
 
 def test_tracking_labels_belong_to_sequence_and_frame(tmp_path):
-    first, second, third, *other = [f.truth() for f in open_recording(tracking_folder(tmp_path))]
+    first, second, third, *other = [f.truth() for f in open_recording(write_tracking_folder(tmp_path))]
     assert first.labels == ["Pedestrian"] and first.extras[0]["track_id"] == 3
     assert [name for name, _ in first.notes] == ["DontCare"]
     assert len(second) == 0
     assert third.labels == ["Person_sitting"] and third.extras[0]["track_id"] == 4
     assert other == [None, None]  # this sequence has no label file
-    assert all(same(through_markers(t), t) for t in (first, second, third))
+    assert all(are_equal_truths(pass_through_markers(t), t) for t in (first, second, third))
 
 
 def test_tracklets_are_placed_by_their_bottom_face(tmp_path):
-    first, second, third = [f.truth() for f in open_recording(raw_folder(tmp_path))]
+    first, second, third = [f.truth() for f in open_recording(write_raw_folder(tmp_path))]
     assert len(first) == 0
     np.testing.assert_allclose(second.boxes, [[8, -1, -0.8, 0.9, 0.5, 1.8, 0.5]])
     assert second.extras[0] == {"track_id": 0, "occluded": 1, "truncated": 0.0}
     assert third.labels == ["Pedestrian", "Person_sitting"]
     np.testing.assert_allclose(third.boxes, [[9, -1, -0.8, 0.9, 0.5, 1.8, 0.6], [5, 2, -1.0, 0.8, 0.6, 1.2, -3]])
     assert [e["track_id"] for e in third.extras] == [0, 1]
-    assert same(through_markers(third), third)
+    assert are_equal_truths(pass_through_markers(third), third)
 
 
 @each_layout

@@ -2,9 +2,19 @@
 
 import numpy as np
 import pytest
-from cli_samples import error_line, exit_of
-from robot_bags import CLOUDS, ON_BASE, base_at, mount, moving, moving_tf, point, recorded, stamps
-from samples import object_folder, walker_label
+from cli_samples import read_error_line, run_main
+from robot_bags import (
+    CLOUDS,
+    ON_BASE,
+    compute_base_pose,
+    list_stamps,
+    make_mount_rows,
+    make_odometry_rows,
+    make_point_cloud,
+    make_tf_rows,
+    write_robot_bag,
+)
+from samples import make_walker_label, write_object_folder
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.camera import Calibration
@@ -39,7 +49,7 @@ CAMERA = Calibration(
 )
 
 
-def pose(i):
+def compute_level_pose(i):
     """Return the pose of a level sensor in frame i."""
     return make_pose([2.0 * i, 0.1 * i, 0.9], Rotation.from_euler("z", 0.1 * i).as_quat())
 
@@ -58,7 +68,7 @@ def make_tilted_frames():
             PointCloud.of(xyz, np.linspace(0, 1, len(xyz), dtype=np.float32), (i + 1) * 10**8, "front"),
             GroundTruth.of(box, [3]),
             camera,
-            pose=lambda i=i: pose(i) @ rotation,
+            pose=lambda i=i: compute_level_pose(i) @ rotation,
             point_truth=lambda: PointTruth(numbers, numbers),
         )
 
@@ -67,7 +77,7 @@ def test_bag_of_tilted_sensor_is_levelled(tmp_path, monkeypatch):
     write_bag(tmp_path / "leaning", make_tilted_frames())
     (tmp_path / "robot.yaml").write_text(MOUNT)
     assert (
-        exit_of(
+        run_main(
             monkeypatch,
             "convert",
             tmp_path / "leaning",
@@ -87,7 +97,7 @@ def test_bag_of_tilted_sensor_is_levelled(tmp_path, monkeypatch):
         np.testing.assert_allclose(truth.boxes[0, :6], PERSON[:6], atol=1e-4)
         assert truth.boxes[0, 6] == pytest.approx(PERSON[6], abs=0.02)  # the z axes differ
         np.testing.assert_allclose(frame.camera().projection, CAMERA.camera().projection, atol=1e-3)
-        np.testing.assert_allclose(frame.pose(), pose(i), atol=1e-6)
+        np.testing.assert_allclose(frame.pose(), compute_level_pose(i), atol=1e-6)
 
 
 def test_level_sensor_at_another_height_is_rotated(tmp_path, monkeypatch):
@@ -99,7 +109,7 @@ def test_level_sensor_at_another_height_is_rotated(tmp_path, monkeypatch):
         "/**:\n  ros__parameters:\n    input: {ahead: 90.0}\n    ground: {sensor_pose: {height: 0.6}}\n"
     )
     assert (
-        exit_of(
+        run_main(
             monkeypatch, "convert", tmp_path / "drive", "--robot", tmp_path / "robot.yaml", "--out", tmp_path / "level"
         )
         == 0
@@ -114,32 +124,37 @@ WORLD = np.random.default_rng(1).uniform(-20, 20, (400, 3)) + [1, 0, 0]
 def make_moving_cloud(stamp):
     """Return the cloud of static points, measured while the sensor moves for 0.1 s."""
     seconds = np.linspace(0, 0.1, len(WORLD))
-    measured = [invert_pose(base_at(stamp + t * 1e9) @ ON_BASE) @ [*point, 1] for point, t in zip(WORLD, seconds)]
+    measured = [
+        invert_pose(compute_base_pose(stamp + t * 1e9) @ ON_BASE) @ [*point, 1] for point, t in zip(WORLD, seconds)
+    ]
     return make_cloud_message(np.array(measured)[:, :3], stamp, "lidar", time=seconds.astype(np.float32))
 
 
-@pytest.mark.parametrize("moves", [moving(ODOMETRY), moving_tf()], ids=["odometry", "TF"])
+@pytest.mark.parametrize("moves", [make_odometry_rows(ODOMETRY), make_tf_rows()], ids=["odometry", "TF"])
 def test_clouds_of_a_bag_are_deskewed(moves, tmp_path, monkeypatch):
-    recorded(tmp_path / "robot", list(moves), mount(), cloud=make_moving_cloud)
-    assert exit_of(monkeypatch, "convert", tmp_path / "robot", "--deskew", "--out", tmp_path / "still") == 0
+    write_robot_bag(tmp_path / "robot", list(moves), make_mount_rows(), cloud=make_moving_cloud)
+    assert run_main(monkeypatch, "convert", tmp_path / "robot", "--deskew", "--out", tmp_path / "still") == 0
     for i, frame in enumerate(open_recording(tmp_path / "still")):
-        world_to_sensor = invert_pose(base_at(stamps()[i]) @ ON_BASE)
+        world_to_sensor = invert_pose(compute_base_pose(list_stamps()[i]) @ ON_BASE)
         expected = WORLD @ world_to_sensor[:3, :3].T + world_to_sensor[:3, 3]
         np.testing.assert_allclose(frame.load().xyz, expected, atol=0.01)
-        blurred = to_point_cloud(make_moving_cloud(stamps()[i]))[0].xyz
+        blurred = to_point_cloud(make_moving_cloud(list_stamps()[i]))[0].xyz
         assert np.abs(blurred - expected).max() > 0.4
     assert i == CLOUDS - 1
 
 
 @pytest.mark.parametrize(
     "parts, cloud, words",
-    [([moving(ODOMETRY), mount()], point, "no time column"), ([], make_moving_cloud, "neither odometry nor a TF")],
+    [
+        ([make_odometry_rows(ODOMETRY), make_mount_rows()], make_point_cloud, "no time column"),
+        ([], make_moving_cloud, "neither odometry nor a TF"),
+    ],
     ids=["no times", "no poses"],
 )
 def test_missing_times_or_poses_are_reported(parts, cloud, words, tmp_path, monkeypatch, capsys):
-    recorded(tmp_path / "robot", *map(list, parts), cloud=cloud)
-    assert exit_of(monkeypatch, "convert", tmp_path / "robot", "--deskew", "--out", tmp_path / "out") == 2
-    assert words in error_line(capsys) and not (tmp_path / "out").exists()
+    write_robot_bag(tmp_path / "robot", *map(list, parts), cloud=cloud)
+    assert run_main(monkeypatch, "convert", tmp_path / "robot", "--deskew", "--out", tmp_path / "out") == 2
+    assert words in read_error_line(capsys) and not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -160,7 +175,7 @@ def test_unusable_parameters_are_reported(content, more, words, tmp_path, monkey
     write_bag(tmp_path / "bag", make_tilted_frames())
     (tmp_path / "robot.yaml").write_text(content)
     assert (
-        exit_of(
+        run_main(
             monkeypatch,
             "convert",
             tmp_path / "bag",
@@ -176,7 +191,7 @@ def test_unusable_parameters_are_reported(content, more, words, tmp_path, monkey
 
 
 def test_data_set_is_not_levelled(tmp_path, monkeypatch, capsys):
-    root = object_folder(tmp_path / "kitti", walker_label())
+    root = write_object_folder(tmp_path / "kitti", make_walker_label())
     (tmp_path / "robot.yaml").write_text(MOUNT)
-    assert exit_of(monkeypatch, "convert", root, "--robot", tmp_path / "robot.yaml", "--out", tmp_path / "out") == 2
-    assert "has level clouds" in error_line(capsys)
+    assert run_main(monkeypatch, "convert", root, "--robot", tmp_path / "robot.yaml", "--out", tmp_path / "out") == 2
+    assert "has level clouds" in read_error_line(capsys)

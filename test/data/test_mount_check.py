@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ground_samples import street
+from ground_samples import make_street
 
 from lidar_perception.data.frame import Recording
 from lidar_perception.data.mount_check import find_height_problem, find_mount_problem, measure_sensor_height
@@ -17,7 +17,7 @@ from lidar_perception.types import PointCloud
 
 @pytest.mark.parametrize("height", [0.4, 1.73, 3.0])
 def test_sensor_height_is_measured(height):
-    xyz, _ = street(5, slope=(0.02, -0.01))
+    xyz, _ = make_street(5, slope=(0.02, -0.01))
     xyz[:, 2] += np.float32(1.73 - height)
     found = measure_sensor_height(xyz)
     assert abs(found - height) < 0.03
@@ -27,7 +27,7 @@ def test_sensor_height_is_measured(height):
 
 
 def test_dense_vehicle_is_not_taken_for_the_ground():
-    xyz, _ = street(5, slope=(0.0, 0.03))
+    xyz, _ = make_street(5, slope=(0.0, 0.03))
     roof = np.random.default_rng(0).uniform((-3, 2.6, -0.35), (3, 4.4, -0.3), (10 * len(xyz), 3)).astype(np.float32)
     assert abs(measure_sensor_height(np.concatenate([xyz, roof])) - 1.73) < 0.05
 
@@ -35,7 +35,7 @@ def test_dense_vehicle_is_not_taken_for_the_ground():
 @pytest.mark.parametrize("lean", [0, 3, 8, -20])
 def test_tilted_sensor_of_a_recording_is_reported(lean):
     pose = SensorPoseParams(pitch=np.radians(lean))
-    clouds = [PointCloud.of(level_points(street(i)[0], pose)) for i in range(3)]
+    clouds = [PointCloud.of(level_points(make_street(i)[0], pose)) for i in range(3)]
     recording = Recording(Path("drive.bag"), "bag", [])
     problem = find_mount_problem(recording, clouds)
     assert (problem is not None) == (abs(lean) > 5)

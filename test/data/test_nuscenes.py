@@ -38,7 +38,7 @@ def root(tmp_path_factory):
 
 
 @pytest.fixture
-def changed(tmp_path):
+def write_changed_tables(tmp_path):
     """Return a function that writes the tables after a change, without sweeps."""
 
     def write(change=lambda tables: None, version=folder.VERSION):
@@ -53,7 +53,7 @@ def find_labels(frame):
     return [row for row in TABLES["sample_annotation"] if row["sample_token"] == frame.native.token]
 
 
-def same_frames(a, b):
+def are_equal_frames(a, b):
     return [f.native.token for f in a] == [f.native.token for f in b] and all(
         f.name == g.name
         and f.points.name == g.points.name
@@ -87,12 +87,12 @@ def test_points_of_an_object_are_inside_its_box(root):
     assert boxes > 100
 
 
-def test_sensor_axes_are_rotated_to_those_of_the_vehicle(changed):
-    def straight(tables):
+def test_sensor_axes_are_rotated_to_those_of_the_vehicle(write_changed_tables):
+    def rotate_sensor(tables):
         for row in tables["calibrated_sensor"]:
             row["rotation"] = [np.sqrt(0.5), 0, 0, -np.sqrt(0.5)]
 
-    frame = open_nuscenes(changed(straight))[0]
+    frame = open_nuscenes(write_changed_tables(rotate_sensor))[0]
     frame.points.parent.mkdir(parents=True)
     np.array(
         [
@@ -199,14 +199,14 @@ def test_labels_have_names_and_attributes(root):
     assert set(CATEGORIES.values()) == set(NAMES) and len(ATTRIBUTES) == 8
 
 
-def test_order_of_table_rows_does_not_matter(root, changed):
-    def shuffle(tables):
+def test_order_of_table_rows_does_not_matter(root, write_changed_tables):
+    def shuffle_rows(tables):
         rng = np.random.default_rng(5)
         for name, rows in tables.items():
             if name not in ("scene", "sample_annotation"):
                 rng.shuffle(rows)
 
-    assert same_frames(open_nuscenes(changed(shuffle)), open_nuscenes(root))
+    assert are_equal_frames(open_nuscenes(write_changed_tables(shuffle_rows)), open_nuscenes(root))
 
 
 @pytest.mark.parametrize("chunk", [1000, 1777])
@@ -214,7 +214,7 @@ def test_tables_can_be_read_in_chunks_of_any_size(root, monkeypatch, chunk):
     whole = open_nuscenes(root)
     monkeypatch.setattr(nuscenes_tables, "CHUNK_SIZE", chunk)
     monkeypatch.setattr(nuscenes_labels, "BLOCK_SIZE", 7)
-    assert same_frames(open_nuscenes(root), whole)
+    assert are_equal_frames(open_nuscenes(root), whole)
 
 
 def test_single_line_and_empty_tables_are_read(tmp_path):
@@ -224,22 +224,22 @@ def test_single_line_and_empty_tables_are_read(tmp_path):
         assert list(Tables(tmp_path, "v").rows("t", "a", "b")) == rows
 
 
-def test_version_without_labels_has_frames(changed):
-    root = changed(lambda tables: tables["sample_annotation"].clear())
+def test_version_without_labels_has_frames(write_changed_tables):
+    root = write_changed_tables(lambda tables: tables["sample_annotation"].clear())
     assert {f.truth() for f in open_nuscenes(root)} == {None}
-    root = changed(lambda tables: tables.pop("sample_annotation"), "v1.0-test")
+    root = write_changed_tables(lambda tables: tables.pop("sample_annotation"), "v1.0-test")
     frames = open_nuscenes(root, "v1.0-test")
     assert len(frames) == 8 and frames[0].truth() is None
 
 
-def drop(table, token):
+def drop_row(table, token):
     def change(tables):
         tables[table] = [row for row in tables[table] if row["token"] != token]
 
     return change
 
 
-def put(table, **values):
+def set_in_first_row(table, **values):
     return lambda tables: tables[table][0].update(values)
 
 
@@ -251,40 +251,40 @@ def put(table, **values):
         (lambda t: t["sample"].clear(), "no key frame"),
         (lambda t: t["sample"][2].pop("timestamp"), "sample.json: row 2 has no timestamp"),
         (lambda t: t["sample"].insert(1, 7), "sample.json: row 1 has no token"),
-        (put("sample", token="s0k1"), "sample.json has rows with the same token"),
-        (drop("sample_data", "s0k1topTrue"), "no LIDAR_TOP for 1 of 8 key frames, such as s0k1"),
-        (drop("ego_pose", "s0k1topTrue"), "ego_pose.json has no row s0k1topTrue"),
-        (drop("instance", "s0o0"), "the instance s0o0 of label s0o0k"),
-        (drop("category", "c0"), "has no category"),
-        (put("sample_annotation", prev="gone"), "another label links to label gone, which is missing"),
-        (put("sample_annotation", rotation=[0, 0, 0, 0]), "a rotation is not a quaternion"),
-        (put("sample_annotation", rotation=[1e308, 0, 0, 0]), "a rotation is not a quaternion"),
-        (put("ego_pose", rotation=[1e-200, 0, 0, 0]), "a rotation is not a quaternion"),
-        (put("sample_annotation", num_lidar_pts=1e308), "a count of points is not 3 finite numbers"),
-        (put("sample_annotation", attribute_tokens=[[]], size=[1, 2]), "a size is not 3 finite"),
-        (put("sample_annotation", translation=[1, None, 2]), "a translation is not"),
-        (put("ego_pose", translation="x"), "ego_pose.json: a translation is not 3 finite"),
-        (put("ego_pose", rotation=[10**400, 0, 0, 0]), "ego_pose.json: a rotation is not"),
+        (set_in_first_row("sample", token="s0k1"), "sample.json has rows with the same token"),
+        (drop_row("sample_data", "s0k1topTrue"), "no LIDAR_TOP for 1 of 8 key frames, such as s0k1"),
+        (drop_row("ego_pose", "s0k1topTrue"), "ego_pose.json has no row s0k1topTrue"),
+        (drop_row("instance", "s0o0"), "the instance s0o0 of label s0o0k"),
+        (drop_row("category", "c0"), "has no category"),
+        (set_in_first_row("sample_annotation", prev="gone"), "another label links to label gone, which is missing"),
+        (set_in_first_row("sample_annotation", rotation=[0, 0, 0, 0]), "a rotation is not a quaternion"),
+        (set_in_first_row("sample_annotation", rotation=[1e308, 0, 0, 0]), "a rotation is not a quaternion"),
+        (set_in_first_row("ego_pose", rotation=[1e-200, 0, 0, 0]), "a rotation is not a quaternion"),
+        (set_in_first_row("sample_annotation", num_lidar_pts=1e308), "a count of points is not 3 finite numbers"),
+        (set_in_first_row("sample_annotation", attribute_tokens=[[]], size=[1, 2]), "a size is not 3 finite"),
+        (set_in_first_row("sample_annotation", translation=[1, None, 2]), "a translation is not"),
+        (set_in_first_row("ego_pose", translation="x"), "ego_pose.json: a translation is not 3 finite"),
+        (set_in_first_row("ego_pose", rotation=[10**400, 0, 0, 0]), "ego_pose.json: a rotation is not"),
         *(
-            (put("sample", timestamp=time), "sample.json: row 0: timestamp is not a time")
+            (set_in_first_row("sample", timestamp=time), "sample.json: row 0: timestamp is not a time")
             for time in (1e38, 10**38, -1, "now", None)
         ),
-        (put("sample_data", filename=7), "sample_data.json: row 0: filename is not a string"),
-        (put("scene", token=[]), "scene.json: row 0: token is not a string"),
-        (put("sample_annotation", attribute_tokens=5), "attribute_tokens is not a list"),
-        (put("calibrated_sensor", rotation=[1, 0, 0, float("nan")]), "a rotation is not"),
+        (set_in_first_row("sample_data", filename=7), "sample_data.json: row 0: filename is not a string"),
+        (set_in_first_row("scene", token=[]), "scene.json: row 0: token is not a string"),
+        (set_in_first_row("sample_annotation", attribute_tokens=5), "attribute_tokens is not a list"),
+        (set_in_first_row("calibrated_sensor", rotation=[1, 0, 0, float("nan")]), "a rotation is not"),
     ],
 )
-def test_invalid_tables_are_reported(changed, change, words):
+def test_invalid_tables_are_reported(write_changed_tables, change, words):
     with pytest.raises(InputError, match=words) as caught:
-        open_nuscenes(changed(change))[0].truth()
+        open_nuscenes(write_changed_tables(change))[0].truth()
     assert "\n" not in str(caught.value)
 
 
-def test_invalid_file_name_is_reported(changed):
+def test_invalid_file_name_is_reported(write_changed_tables):
     with pytest.raises(InputError, match=r"x00b' is not a valid file name"):
         for frame in open_nuscenes(
-            changed(lambda tables: [row.update(filename="a\0b") for row in tables["sample_data"]])
+            write_changed_tables(lambda tables: [row.update(filename="a\0b") for row in tables["sample_data"]])
         ):
             frame.load()
 
@@ -300,8 +300,8 @@ def test_invalid_file_name_is_reported(changed):
         lambda text: text.replace("[", "[" * 100_000, 2),
     ],
 )
-def test_damaged_tables_are_reported(changed, damage):
-    root = changed()
+def test_damaged_tables_are_reported(write_changed_tables, damage):
+    root = write_changed_tables()
     path = root / folder.VERSION / "ego_pose.json"
     path.write_text(damage(path.read_text()))
     with pytest.raises(InputError, match=r"ego_pose.json .*download the tables of v1.0") as caught:
@@ -309,8 +309,8 @@ def test_damaged_tables_are_reported(changed, damage):
     assert "\n" not in str(caught.value)
 
 
-def test_damaged_large_table_is_not_read_to_the_end(changed, monkeypatch):
-    root = changed()
+def test_damaged_large_table_is_not_read_to_the_end(write_changed_tables, monkeypatch):
+    root = write_changed_tables()
     path = root / folder.VERSION / "ego_pose.json"
     text = json.dumps(TABLES["ego_pose"] * 50).replace("{", "{?", 1)
     path.write_bytes(text.encode() + b"\xff")  # would cause another error if it were read
@@ -330,8 +330,8 @@ def test_wrong_folder_is_reported(root, tmp_path):
             open_nuscenes(place, version)
 
 
-def test_missing_or_truncated_sweep_is_reported(changed):
-    frame = open_nuscenes(changed())[0]
+def test_missing_or_truncated_sweep_is_reported(write_changed_tables):
+    frame = open_nuscenes(write_changed_tables())[0]
     with pytest.raises(InputError, match=r"cannot read .*s0k0topTrue.pcd.bin"):
         frame.load()
     frame.points.parent.mkdir(parents=True)
@@ -342,9 +342,9 @@ def test_missing_or_truncated_sweep_is_reported(changed):
     assert len(frame.load()) == 0
 
 
-def test_real_sweep_is_read(data, changed):
+def test_real_sweep_is_read(data, write_changed_tables):
     (path,) = (data / "nuscenes").glob("*.pcd.bin")
-    frame = open_nuscenes(changed())[0]
+    frame = open_nuscenes(write_changed_tables())[0]
     frame.points.parent.mkdir(parents=True)
     frame.points.symlink_to(path)
     scan = frame.load()

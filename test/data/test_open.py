@@ -9,8 +9,8 @@ import numpy as np
 import nuscenes_folder
 import pytest
 from bag_samples import cloud_frame
-from recording_samples import MADE, cloud_folder, drive, each_recording, nuscenes_root, semantic_folder
-from samples import STAMP, object_folder, scene, write
+from recording_samples import MADE, cloud_folder, each_recording, make_drive_pose, nuscenes_root, semantic_folder
+from samples import STAMP, make_scene, write_file, write_object_folder
 
 from lidar_perception.cli.data import open_and_describe
 from lidar_perception.data.bag import Bag, BagWriter
@@ -84,11 +84,11 @@ def test_cloud_files_are_ordered_and_stamped_by_name(tmp_path):
     ):
         timed = tmp_path / names[0]
         for name in names:
-            write(timed / f"{name}.bin", scene(0).astype(np.float32).tobytes())
+            write_file(timed / f"{name}.bin", make_scene(0).astype(np.float32).tobytes())
         recording = open_recording(timed)
         assert [f.stamp_ns - 17 * 10**17 for f in recording] == [10**8, 35 * 10**7]
         assert [f.load().stamp_ns for f in recording] == [f.stamp_ns for f in recording]
-        write(timed / "last.bin", scene(0).astype(np.float32).tobytes())
+        write_file(timed / "last.bin", make_scene(0).astype(np.float32).tobytes())
         assert "no times" in str(open_recording(timed))
 
 
@@ -102,7 +102,7 @@ def test_cloud_topic_of_a_bag_is_inferred_or_given(tmp_path):
                         topic,
                         STAMP + i,
                         from_array(
-                            scene(i).astype("<f4").view([(n, "<f4") for n in "xyzi"]).ravel(),
+                            make_scene(i).astype("<f4").view([(n, "<f4") for n in "xyzi"]).ravel(),
                             make_header(STAMP + i, "lidar", make_bag_message),
                             make_bag_message,
                         ),
@@ -127,7 +127,7 @@ def test_commands_measure_the_sensor_height_if_unknown(tmp_path, height, expecte
     ground = rng.uniform([-20, -20, -0.02], [20, 20, 0.02], (9000, 3)) - [0, 0, height]
     cloud = np.column_stack([ground, np.ones(len(ground))]).astype(np.float32)
     write_bag(tmp_path / "bag", [Frame.of(str(i), cloud_frame(cloud, STAMP + i * 10**8)) for i in range(4)])
-    write(tmp_path / "files/0.bin", cloud.tobytes())
+    write_file(tmp_path / "files/0.bin", cloud.tobytes())
     for path in (tmp_path / "bag", tmp_path / "files"):
         recording = open_and_describe(path)
         for frames in (recording.frames, recording.reopen().frames):
@@ -142,10 +142,10 @@ def test_commands_measure_the_sensor_height_if_unknown(tmp_path, height, expecte
     [
         (lambda p: p / "missing", "missing does not exist; give a bag or the folder of a data set"),
         (lambda p: p, "in a supported format: expected a rosbag2 bag, or the folder of KITTI"),
-        (lambda p: write(p / "notes.txt", b"text"), "not a bag; give the folder of a rosbag2 bag"),
-        (lambda p: write(p / "training/velodyne/x", b"").parents[2], "has no KITTI scans: expected"),
+        (lambda p: write_file(p / "notes.txt", b"text"), "not a bag; give the folder of a rosbag2 bag"),
+        (lambda p: write_file(p / "training/velodyne/x", b"").parents[2], "has no KITTI scans: expected"),
         (
-            lambda p: write(p / "sequences/00/x", b"").parents[2],
+            lambda p: write_file(p / "sequences/00/x", b"").parents[2],
             "no scans of KITTI odometry or SemanticKITTI: expected",
         ),
         (
@@ -161,7 +161,7 @@ def test_invalid_recording_is_reported_with_remedy(tmp_path, make, words):
 
 
 def test_labels_without_scan_are_listed(tmp_path):
-    root = object_folder(tmp_path, count=3)
+    root = write_object_folder(tmp_path, count=3)
     (root / "training/velodyne/000001.bin").unlink()
     recording = open_recording(root)
     assert [f.name for f in recording] == ["000000", "000002"]
@@ -179,7 +179,7 @@ def test_split_selects_each_frame_once_in_its_order(tmp_path, kind):
     root = MADE[kind][0](tmp_path / kind)
     names = [frame.name for frame in open_recording(root)]
     requested = [names[-1], names[0], names[-1]]
-    recording = open_recording(root, split=write(tmp_path / "split.txt", "\n".join(requested)))
+    recording = open_recording(root, split=write_file(tmp_path / "split.txt", "\n".join(requested)))
     assert [f.name for f in recording] == [f.name for f in recording.reopen()] == requested[:2]
     assert len(recording.frames[0].load()) and str(recording).count("2 frames") == 1
     whole = open_recording(root)
@@ -201,13 +201,13 @@ def test_split_accepts_names_of_sequences(tmp_path, kind, sequences):
         (sequences, first + second),
         ((first[-1], *sequences), first[-1:] + first[:-1] + second),
     ):
-        split = write(tmp_path / "split.txt", "\n".join(requested) + "\n")
+        split = write_file(tmp_path / "split.txt", "\n".join(requested) + "\n")
         assert [f.name for f in open_recording(root, split=split)] == expected
 
 
 @pytest.mark.no_cover
-def test_invalid_split_is_reported(tmp_path, written):
-    for root in (object_folder(tmp_path / "kitti"), written):
+def test_invalid_split_is_reported(tmp_path, sample_bag):
+    for root in (write_object_folder(tmp_path / "kitti"), sample_bag):
         first = next(iter(open_recording(root))).name
         for text, words in (
             ("", f"is empty; write the name of a frame or sequence on each line, such as {first}"),
@@ -215,7 +215,7 @@ def test_invalid_split_is_reported(tmp_path, written):
             (b"\xff\xfe\x00", "cannot read the split"),
         ):
             with pytest.raises(InputError, match=words) as error:
-                open_recording(root, split=write(tmp_path / "split.txt", text))
+                open_recording(root, split=write_file(tmp_path / "split.txt", text))
             assert "\n" not in str(error.value) and "split.txt" in str(error.value)
         with pytest.raises(InputError, match="cannot read the split"):
             open_recording(root, split=tmp_path / "missing.txt")
@@ -225,7 +225,7 @@ def test_invalid_split_is_reported(tmp_path, written):
 
 
 def test_unusable_returns_are_dropped_from_all_columns(tmp_path):
-    xyz = scene().astype(np.float64)[:, :3]
+    xyz = make_scene().astype(np.float64)[:, :3]
     intensity = np.arange(len(xyz), dtype=np.float32)
     bad = {3: np.nan, 10: np.inf, 11: -np.inf, 20: 0.0, 21: 1e6}
     for index, value in bad.items():
@@ -248,12 +248,12 @@ def test_unusable_returns_are_dropped_from_all_columns(tmp_path):
 def test_semantickitti_poses_are_read_unchanged(tmp_path):
     frames = open_recording(semantic_folder(tmp_path)).frames
     for frame in frames:
-        np.testing.assert_allclose(frame.pose(), drive(int(frame.points.stem)), atol=1e-9)
+        np.testing.assert_allclose(frame.pose(), make_drive_pose(int(frame.points.stem)), atol=1e-9)
     stamps = [frame.stamp_ns for frame in frames]
     assert np.diff(stamps).tolist() == [PERIOD_NS, GAP_NS]  # a gap separates drives
     frames[0].points.unlink()
     assert [f.index for f in open_recording(tmp_path)] == [1, 0]
-    np.testing.assert_allclose(open_recording(tmp_path).frames[0].pose(), drive(1), atol=1e-9)
+    np.testing.assert_allclose(open_recording(tmp_path).frames[0].pose(), make_drive_pose(1), atol=1e-9)
     frames[0].points.write_bytes(b"")
     (tmp_path / "sequences/00/poses.txt").write_text("1 0 0\n")
     with pytest.raises(InputError, match=r"cannot read pose 0 of .*poses.txt .*download it again"):

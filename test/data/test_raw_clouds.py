@@ -27,7 +27,7 @@ LAYOUT = [
 ]
 
 
-def points(n=200):
+def make_points(n=200):
     rng = np.random.default_rng(1)
     made = np.zeros(n, LAYOUT)
     for name in made.dtype.names:
@@ -74,7 +74,7 @@ def compress_lzf(data):
     return bytes(out)
 
 
-def pcd(cloud, kind):
+def format_pcd(cloud, kind):
     kinds = {"f": "F", "u": "U", "i": "I"}
     parts = [cloud.dtype[name] for name in cloud.dtype.names]
     head = "\n".join(
@@ -111,11 +111,11 @@ def pcd(cloud, kind):
 @pytest.mark.parametrize("kind", ["ascii", "binary", "binary_compressed"])
 def test_pcd_file_returns_the_written_points(tmp_path, kind):
     path = tmp_path / "one.pcd"
-    path.write_bytes(pcd(points(), kind))
-    assert read_pcd(path).dtype.names == points().dtype.names
-    assert np.array_equal(read_pcd(path), points())
+    path.write_bytes(format_pcd(make_points(), kind))
+    assert read_pcd(path).dtype.names == make_points().dtype.names
+    assert np.array_equal(read_pcd(path), make_points())
     for cut in (0, 40, len(path.read_bytes()) // 2):
-        path.write_bytes(pcd(points(), kind)[:cut])
+        path.write_bytes(format_pcd(make_points(), kind)[:cut])
         with pytest.raises(InputError, match=r"one\.pcd") as error:
             read_pcd(path)
         assert "\n" not in str(error.value)
@@ -126,7 +126,7 @@ def test_integers_in_text_keep_all_digits(tmp_path):
     for name in ("u1", "i1", "u4", "i8", "u8"):
         limits = np.iinfo(name)
         cloud = np.array([(limits.min,), (limits.max,)], [("n", name)])
-        path.write_bytes(pcd(cloud, "ascii"))
+        path.write_bytes(format_pcd(cloud, "ascii"))
         assert np.array_equal(read_pcd(path), cloud)
 
 
@@ -165,7 +165,7 @@ def test_invalid_pcd_file_is_reported(tmp_path, text):
 
 def test_cloud_files_and_folders_are_opened(tmp_path):
     for i in range(3):
-        (tmp_path / f"{i}.pcd").write_bytes(pcd(points(50 + i), "binary"))
+        (tmp_path / f"{i}.pcd").write_bytes(format_pcd(make_points(50 + i), "binary"))
     clouds = open_clouds(tmp_path)
     assert clouds.count == 3 and clouds.stamps_ns is None and "3 .pcd files" in clouds.layout
     assert [len(to_array(clouds.load(i))) for i in range(3)] == [50, 51, 52]
@@ -194,7 +194,7 @@ def test_records_with_other_columns_are_rejected(tmp_path, more):
 
 
 def make_bag_points(n):
-    made = points(n)
+    made = make_points(n)
     layout = [(name, kind) for name, kind, *_ in LAYOUT[:5]]
     cloud = np.empty(n, layout)
     for name, _ in layout:
@@ -202,7 +202,7 @@ def make_bag_points(n):
     return cloud
 
 
-def write(path, topics, count=4):
+def write_clouds(path, topics, count=4):
     with BagWriter(path) as bag:
         for topic in topics:
             bag.add_topic(topic, "sensor_msgs/msg/PointCloud2")
@@ -214,11 +214,11 @@ def write(path, topics, count=4):
 
 
 def test_bag_with_several_sensors_needs_a_topic(tmp_path):
-    write(tmp_path / "one", ["/front/scan"])
+    write_clouds(tmp_path / "one", ["/front/scan"])
     clouds = open_clouds(tmp_path / "one")
     assert clouds.count == 4 and clouds.stamps_ns.tolist() == [0, 10**8, 2 * 10**8, 3 * 10**8]
     assert np.array_equal(to_array(clouds.load(2)), make_bag_points(92))
-    write(tmp_path / "three", ["/left", "/right", "/rear"])
+    write_clouds(tmp_path / "three", ["/left", "/right", "/rear"])
     with pytest.raises(InputError, match="on /left, /rear, /right; choose"):
         open_clouds(tmp_path / "three")
     assert open_clouds(tmp_path / "three", "/rear").load(1).header.frame_id == "rear"
@@ -228,11 +228,11 @@ def test_bag_with_several_sensors_needs_a_topic(tmp_path):
 
 def test_times_in_file_names_are_read_as_stamps(tmp_path):
     for name in ("1700000000.1", "1700000000.2"):
-        (tmp_path / f"{name}.pcd").write_bytes(pcd(points(), "ascii"))
+        (tmp_path / f"{name}.pcd").write_bytes(format_pcd(make_points(), "ascii"))
     clouds = open_clouds(tmp_path)
     assert clouds.stamps_ns.tolist() == [17 * 10**17 + 10**8, 17 * 10**17 + 2 * 10**8]
     assert clouds.load(1).header.stamp.nanosec == 2 * 10**8
-    (tmp_path / "another.pcd").write_bytes(pcd(points(), "ascii"))
+    (tmp_path / "another.pcd").write_bytes(format_pcd(make_points(), "ascii"))
     assert open_clouds(tmp_path).stamps_ns is None
 
 
@@ -245,7 +245,7 @@ def test_times_in_file_names_are_read_as_stamps(tmp_path):
 )  # KITTI's frame numbers
 def test_files_are_ordered_by_time_or_number(names, timed, tmp_path):
     for name in reversed(names):
-        (tmp_path / f"{name}.pcd").write_bytes(pcd(points(), "ascii"))
+        (tmp_path / f"{name}.pcd").write_bytes(format_pcd(make_points(), "ascii"))
     recording = open_recording(tmp_path)
     assert [frame.name for frame in recording] == names
     stamps = [frame.stamp_ns for frame in recording]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from bag_samples import cloud_frame
-from cli_samples import exit_of
-from samples import STAMP, calibration_text, write
+from cli_samples import run_main
+from samples import STAMP, make_calibration_text, write_file
 
 from lidar_perception.data.bag import BagWriter
 from lidar_perception.data.frame import Frame
@@ -21,7 +21,7 @@ from msg_utils.stamps import make_header
 COUNT = 5
 
 
-def clouds(full, whole=False):
+def make_clouds(full, whole=False):
     """Yield clouds (50, 4) [x y z intensity] of a sensor with this scale; the first one is dark."""
     rng = np.random.default_rng(0)
     for i in range(COUNT):
@@ -32,44 +32,44 @@ def clouds(full, whole=False):
         yield i, cloud.astype(np.float32)
 
 
-def object_files(root, clouds):
+def write_object_files(root, clouds):
     for i, cloud in clouds:
-        write(root / f"training/velodyne/{i:06}.bin", cloud.tobytes())
-        write(root / f"training/calib/{i:06}.txt", calibration_text())
+        write_file(root / f"training/velodyne/{i:06}.bin", cloud.tobytes())
+        write_file(root / f"training/calib/{i:06}.txt", make_calibration_text())
 
 
-def tracking_files(root, clouds):
+def write_tracking_files(root, clouds):
     for i, cloud in clouds:
-        write(root / f"training/velodyne/{i // 3:04}/{i:06}.bin", cloud.tobytes())
-        write(root / f"training/calib/{i // 3:04}.txt", calibration_text())
+        write_file(root / f"training/velodyne/{i // 3:04}/{i:06}.bin", cloud.tobytes())
+        write_file(root / f"training/calib/{i // 3:04}.txt", make_calibration_text())
     (root / "training/label_02").mkdir()
 
 
-def raw_files(root, clouds):
+def write_raw_files(root, clouds):
     drive = root / "2011_09_26/2011_09_26_drive_0001_sync/velodyne_points"
     for i, cloud in clouds:
-        write(drive / f"data/{i:010}.bin", cloud.tobytes())
-    write(drive / "timestamps.txt", "".join(f"2011-09-26 13:02:2{i}.0\n" for i in range(COUNT)))
+        write_file(drive / f"data/{i:010}.bin", cloud.tobytes())
+    write_file(drive / "timestamps.txt", "".join(f"2011-09-26 13:02:2{i}.0\n" for i in range(COUNT)))
 
 
-def semantic_files(root, clouds):
+def write_semantic_files(root, clouds):
     for i, cloud in clouds:
         write_scan(root / "sequences/00", i, cloud, np.zeros(50), np.zeros(50))
 
 
-def bin_files(root, clouds):
+def write_bin_files(root, clouds):
     for i, cloud in clouds:
-        write(root / f"{i}.bin", cloud.tobytes())
+        write_file(root / f"{i}.bin", cloud.tobytes())
 
 
-def npy_files(root, clouds):
+def write_npy_files(root, clouds):
     for i, cloud in clouds:
         np.save(root / f"{i}.npy", cloud)
 
 
-def pcd_files(root, clouds):
+def write_pcd_files(root, clouds):
     for i, cloud in clouds:
-        write(
+        write_file(
             root / f"{i}.pcd",
             (
                 b"VERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
@@ -79,13 +79,22 @@ def pcd_files(root, clouds):
         )
 
 
-def bag(root, clouds):
+def write_bag_files(root, clouds):
     write_bag(root / "drive", [Frame.of(str(i), cloud_frame(cloud, STAMP + i * 10**8)) for i, cloud in clouds])
 
 
 LAYOUTS = {
-    each.__name__: each
-    for each in (object_files, tracking_files, raw_files, semantic_files, bin_files, npy_files, pcd_files, bag)
+    each.__name__.removeprefix("write_"): each
+    for each in (
+        write_object_files,
+        write_tracking_files,
+        write_raw_files,
+        write_semantic_files,
+        write_bin_files,
+        write_npy_files,
+        write_pcd_files,
+        write_bag_files,
+    )
 }
 
 
@@ -94,9 +103,9 @@ LAYOUTS = {
     "full, whole", [(1, False), (100, False), (255, False), (255, True), (1023, True), (65535, True)]
 )
 def test_scale_does_not_depend_on_order_of_frames(tmp_path, layout, full, whole):
-    LAYOUTS[layout](tmp_path, clouds(full, whole))
-    path = tmp_path / "drive" if layout == "bag" else tmp_path
-    expected = [cloud[:, 3] / np.float32(full) for _, cloud in clouds(full, whole)]
+    LAYOUTS[layout](tmp_path, make_clouds(full, whole))
+    path = tmp_path / "drive" if layout == "bag_files" else tmp_path
+    expected = [cloud[:, 3] / np.float32(full) for _, cloud in make_clouds(full, whole)]
     for order in (range(COUNT), [COUNT - 1, 0, 2, 1, 3]):
         frames = open_recording(path).frames
         for i in order:
@@ -104,7 +113,7 @@ def test_scale_does_not_depend_on_order_of_frames(tmp_path, layout, full, whole)
             assert scan.intensity.tobytes() == expected[i].tobytes()
             assert frames[i].intensity_max() == full
     assert np.array_equal(next(iter(open_recording(path))).load().intensity, expected[0])
-    if layout in ("bin_files", "pcd_files", "bag"):  # for convert --robot
+    if layout in ("bin_files", "pcd_files", "bag_files"):  # for convert --robot
         assert np.array_equal(level_frame(frames[0], SensorMount()).load().intensity, expected[0])
         given = level_frame(frames[0], SensorMount(intensity_max=10.0)).load().intensity
         assert np.allclose(given, expected[0] * full / 10)
@@ -138,7 +147,7 @@ def test_scale_depends_on_the_type_of_the_field(tmp_path, kind, values, full):
 def test_empty_and_black_clouds_do_not_affect_the_scale(tmp_path):
     xyz = np.ones((50, 3))
     first = [np.zeros((0, 4), np.float32), np.column_stack([xyz, np.zeros(50)])] * 8
-    rest = [cloud for _, cloud in clouds(255)]
+    rest = [cloud for _, cloud in make_clouds(255)]
     write_bag(
         tmp_path / "drive",
         [
@@ -151,8 +160,8 @@ def test_empty_and_black_clouds_do_not_affect_the_scale(tmp_path):
 
 
 def test_invalid_cloud_does_not_affect_the_scale(tmp_path):
-    object_files(tmp_path, clouds(255))
-    write(tmp_path / "training/velodyne/000004.bin", b"cut")
+    write_object_files(tmp_path, make_clouds(255))
+    write_file(tmp_path / "training/velodyne/000004.bin", b"cut")
     frames = open_recording(tmp_path).frames
     assert frames[1].load().intensity.max() == 1.0
     (tmp_path / "training/velodyne/000003.bin").unlink()
@@ -160,15 +169,15 @@ def test_invalid_cloud_does_not_affect_the_scale(tmp_path):
 
 
 def test_commands_report_the_scale_and_export_unit_intensity(tmp_path, monkeypatch, capfd):
-    object_files(tmp_path / "own", clouds(255))
-    assert exit_of(monkeypatch, "convert", tmp_path / "own", "--out", tmp_path / "own.bag") == 0
+    write_object_files(tmp_path / "own", make_clouds(255))
+    assert run_main(monkeypatch, "convert", tmp_path / "own", "--out", tmp_path / "own.bag") == 0
     assert "intensity 0 .. 255, read as 0 .. 1" in capfd.readouterr().err
     assert open_recording(tmp_path / "own.bag").frames[1].load().intensity.max() == 1.0
-    assert exit_of(monkeypatch, "info", tmp_path / "own") == 0
+    assert run_main(monkeypatch, "info", tmp_path / "own") == 0
     assert "0 .. 255 in the files" in " ".join(capfd.readouterr().out.split())
-    dark = np.tile(next(clouds(0.01))[1], (30, 1))
-    object_files(tmp_path / "dark", [(0, dark)])
-    assert exit_of(monkeypatch, "convert", tmp_path / "dark", "--out", tmp_path / "dark.bag") == 0
+    dark = np.tile(next(make_clouds(0.01))[1], (30, 1))
+    write_object_files(tmp_path / "dark", [(0, dark)])
+    assert run_main(monkeypatch, "convert", tmp_path / "dark", "--out", tmp_path / "dark.bag") == 0
     output = " ".join(capfd.readouterr().err.split())
     assert (
         "the highest intensity is 0.01, but a full reflection should be 1" in output and "input.intensity_max" in output

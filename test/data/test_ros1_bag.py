@@ -5,7 +5,14 @@ import shutil
 import numpy as np
 import pytest
 from bag_samples import as_ros1
-from robot_bags import check, mount, moving, recorded, tf, transform
+from robot_bags import (
+    check_poses,
+    make_mount_rows,
+    make_odometry_rows,
+    make_tf_message,
+    make_transform,
+    write_robot_bag,
+)
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -40,15 +47,15 @@ def test_folder_with_bag_suffix_is_a_ros2_bag(drive_bag, tmp_path):
 
 
 def test_poses_come_from_odometry_and_tf(tmp_path):
-    recorded(tmp_path / "robot", moving(ODOMETRY), mount())
-    check(open_recording(as_ros1(tmp_path / "robot", tmp_path / "robot.bag", "bz2")))
+    write_robot_bag(tmp_path / "robot", make_odometry_rows(ODOMETRY), make_mount_rows())
+    check_poses(open_recording(as_ros1(tmp_path / "robot", tmp_path / "robot.bag", "bz2")))
 
 
 def test_ros1_tf_latched_topics_and_unknown_types_are_read(tmp_path):
     store = get_typestore(Stores.ROS1_NOETIC)
     for kind in ("tf/msg/tfMessage", "tf2_msgs/msg/TFMessage", "driver_msgs/msg/Packet"):
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
-    stamped = tf(transform("a", "b", 0, np.eye(4)))
+    stamped = make_tf_message(make_transform("a", "b", 0, np.eye(4)))
     with Writer(tmp_path / "old.bag") as bag:
         for topic, kind, latched in (
             ("/tf", "tf/msg/tfMessage", 0),

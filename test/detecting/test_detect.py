@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from bag_samples import cloud_frame, scans
 from cli_samples import evaluate_detection
-from detect_samples import NAME, MadeDetector, detect, make_run, objects, read_json, refused
-from kitti_samples import tracking_folder
+from detect_samples import NAME, MadeDetector, detect, detect_with_error, list_objects, make_run, read_json
+from kitti_samples import write_tracking_folder
 from PIL import Image
 from recording_samples import MADE
-from samples import STAMP, object_folder, scene, walker_label, write
+from samples import STAMP, make_scene, make_walker_label, write_file, write_object_folder
 
 from lidar_perception.camera import FORWARD_CAMERA
 from lidar_perception.data.bag import Bag
@@ -45,10 +45,10 @@ ALL = "kitti,json,csv,mcap,openlabel"
 
 
 @pytest.fixture(autouse=True)
-def made(monkeypatch):
+def stand_in_calls(monkeypatch):
     """Register MadeDetector under NAME, and return the list of its calls."""
     monkeypatch.setitem(LOAD, NAME, "")
-    monkeypatch.setattr(opening, "_find_loader", lambda kind: detect_samples.opened)
+    monkeypatch.setattr(opening, "_find_loader", lambda kind: detect_samples.load_made_detector)
     monkeypatch.setattr(MadeDetector, "calls", [])
     return MadeDetector.calls
 
@@ -56,28 +56,28 @@ def made(monkeypatch):
 @pytest.fixture
 def kitti(tmp_path):
     """Four labelled frames."""
-    return object_folder(tmp_path / "kitti", walker_label() + "\n", 4)
+    return write_object_folder(tmp_path / "kitti", make_walker_label() + "\n", 4)
 
 
 @pytest.fixture
 def drives(tmp_path):
     """Two sequences, of three and of two frames."""
-    return tracking_folder(tmp_path / "drives")
+    return write_tracking_folder(tmp_path / "drives")
 
 
 # Output files
 
 
 @pytest.mark.parametrize("kind", MADE)
-def test_every_frame_of_any_recording_has_a_result(kind, tmp_path, monkeypatch, made):
+def test_every_frame_of_any_recording_has_a_result(kind, tmp_path, monkeypatch, stand_in_calls):
     data, out = MADE[kind][0](tmp_path / "in/bag"), tmp_path / "out"
     assert detect(monkeypatch, data, "--out", out, "--format", "json,csv,kitti") == 0
     names = [frame.name for frame in open_recording(data)]
     content = read_json(out)
-    assert [frame["name"] for frame in content["frames"]] == names and len(made) == len(names)
+    assert [frame["name"] for frame in content["frames"]] == names and len(stand_in_calls) == len(names)
     assert content["detector"] == content["weights"] == NAME and content["skipped"] == []
     assert content["parameters"]["least"] == 0.5 and "metres" in content["units"]["box"]
-    rows_by_frame = objects(content)
+    rows_by_frame = list_objects(content)
     for frame, entry in zip(open_recording(data), content["frames"]):
         assert {k: entry[k] for k in ("sequence", "index", "stamp_ns", "frame_id")} == {
             "sequence": frame.sequence,
@@ -103,7 +103,7 @@ def test_every_frame_of_any_recording_has_a_result(kind, tmp_path, monkeypatch, 
 def test_all_formats_of_a_run_have_the_same_boxes(drives, tmp_path, monkeypatch):
     out = tmp_path / "out"
     assert detect(monkeypatch, drives, "--out", out, "--format", ALL, "--min-score", 0.1) == 0
-    rows_by_frame = objects(read_json(out))
+    rows_by_frame = list_objects(read_json(out))
     assert {len(rows) for rows in rows_by_frame.values()} == {2}
     frames = open_recording(drives).frames
     labels = import_labels(out / "openlabel", "openlabel", frames)
@@ -173,7 +173,7 @@ def test_bag_with_duplicate_stamps_is_written_without_labels(tmp_path, monkeypat
 
 @pytest.mark.parametrize("camera", [True, False], ids=["camera", "nominal"])
 def test_written_results_score_like_the_detector(kitti, tmp_path, monkeypatch, camera, capsys):
-    write(kitti / "training/velodyne/000002.bin", b"123")  # skipped by both commands
+    write_file(kitti / "training/velodyne/000002.bin", b"123")  # skipped by both commands
     if not camera:
         frames = [replace(frame, calibration=return_none) for frame in open_recording(kitti)]
         kitti = tmp_path / "bag"
@@ -221,7 +221,7 @@ def test_tracks_of_different_drives_have_different_ids(drives, tmp_path, monkeyp
         assert [e["velocity"] for e in frame_labels.extra] == [row["velocity"] for row in entry["objects"]]
         camera = frame.calibration().lidar_to_camera
         tracks = read_tracking_labels(out / f"kitti/{frame.sequence}.txt", camera)[frame.index]
-        np.testing.assert_allclose(tracks.boxes[:, :3], np.array(objects(content)[frame.name])[:, 2:5], atol=2e-4)
+        np.testing.assert_allclose(tracks.boxes[:, :3], np.array(list_objects(content)[frame.name])[:, 2:5], atol=2e-4)
         assert [e["track_id"] for e in tracks.extras] == frame_labels.track_ids.tolist()
 
 
@@ -249,7 +249,7 @@ def test_written_tracks_score_like_the_tracker(drives, tmp_path, monkeypatch):
 def test_each_drive_of_a_bag_is_tracked_separately(tmp_path, monkeypatch):
     """Drives of a bag have no names, so their files are numbered."""
     stamps = [STAMP + s * 10**8 for s in (0, 1, 100, 101)]
-    write_bag(tmp_path / "bag", [Frame.of(str(i), cloud_frame(scene(i), stamp)) for i, stamp in enumerate(stamps)])
+    write_bag(tmp_path / "bag", [Frame.of(str(i), cloud_frame(make_scene(i), stamp)) for i, stamp in enumerate(stamps)])
     out = tmp_path / "out"
     assert detect(monkeypatch, tmp_path / "bag", "--out", out, "--format", "json,kitti", "--track") == 0
     ids = [{row["id"] for row in frame["objects"]} for frame in read_json(out)["frames"]]
@@ -262,24 +262,24 @@ def test_each_drive_of_a_bag_is_tracked_separately(tmp_path, monkeypatch):
 # Interrupted runs, and other runs in the same folder
 
 
-class Stopped(Exception):
+class StoppedRun(Exception):
     """Stop a run in the middle."""
 
 
-def test_stopped_run_is_resumed(drives, tmp_path, made):
+def test_stopped_run_is_resumed(drives, tmp_path, stand_in_calls):
     def stop(scan):
-        if len(made) == 3:
-            raise Stopped
+        if len(stand_in_calls) == 3:
+            raise StoppedRun
 
     recording = open_recording(drives)
     full_run, stopped_run = (make_run(recording, tmp_path / name) for name in ("whole", "parts"))
     run_detector(full_run, MadeDetector, [Json], tracking=TrackingParams(), ego="none")
-    made.clear()
-    with pytest.raises(Stopped):
+    stand_in_calls.clear()
+    with pytest.raises(StoppedRun):
         run_detector(stopped_run, partial(MadeDetector, fails=stop), [Json], ego="none", tracking=TrackingParams())
-    assert len(made) == 3 and not (tmp_path / "parts/detections.json").exists()
+    assert len(stand_in_calls) == 3 and not (tmp_path / "parts/detections.json").exists()
     run_detector(stopped_run, MadeDetector, [Json], tracking=TrackingParams(), ego="none")
-    assert len(made) == len(recording)  # none of them twice
+    assert len(stand_in_calls) == len(recording)  # none of them twice
     assert read_json(tmp_path / "parts") == read_json(tmp_path / "whole")
 
 
@@ -292,43 +292,43 @@ def test_number_of_processes_does_not_change_the_result(drives, tmp_path):
     assert read_json(tmp_path / "one") == read_json(tmp_path / "two")
 
 
-def test_folder_of_another_run_needs_force(kitti, tmp_path, monkeypatch, capsys, made):
+def test_folder_of_another_run_needs_force(kitti, tmp_path, monkeypatch, capsys, stand_in_calls):
     out = tmp_path / "out"
     assert detect(monkeypatch, kitti, "--out", out, "--format", "kitti,csv", "--limit", 2) == 0
     assert detect(monkeypatch, kitti, "--out", out) == 0  # all frames, another format
-    assert len(made) == 4 and len(read_json(out)["frames"]) == 4
+    assert len(stand_in_calls) == 4 and len(read_json(out)["frames"]) == 4
     capsys.readouterr()
-    line = refused(monkeypatch, capsys, kitti, "--out", out, "--min-score", 0.1)
+    line = detect_with_error(monkeypatch, capsys, kitti, "--out", out, "--min-score", 0.1)
     assert f"{out} has a run with other settings (min_scores" in line and "--force" in line
     assert detect(monkeypatch, kitti, "--out", out, "--min-score", 0.1, "--force") == 0
-    assert len(made) == 8 and not (out / "detections.csv").exists()
-    assert not [*out.glob("kitti/*")] and len(objects(read_json(out))["000000"]) == 2
-    write(tmp_path / "mine/letter.txt", "dear")
-    error = refused(monkeypatch, capsys, kitti, "--out", tmp_path / "mine")
+    assert len(stand_in_calls) == 8 and not (out / "detections.csv").exists()
+    assert not [*out.glob("kitti/*")] and len(list_objects(read_json(out))["000000"]) == 2
+    write_file(tmp_path / "mine/letter.txt", "dear")
+    error = detect_with_error(monkeypatch, capsys, kitti, "--out", tmp_path / "mine")
     assert "has no run of this command" in error
 
 
 # Invalid options
 
 
-def test_unreadable_frames_are_reported_and_skipped(kitti, tmp_path, monkeypatch, capsys, made):
+def test_unreadable_frames_are_reported_and_skipped(kitti, tmp_path, monkeypatch, capsys, stand_in_calls):
     scan_path, out = kitti / "training/velodyne/000001.bin", tmp_path / "out"
     content_bytes = scan_path.read_bytes()
-    write(scan_path, b"123")
+    write_file(scan_path, b"123")
     for _ in range(2):  # the failure is not remembered
         assert detect(monkeypatch, kitti, "--out", out, "--format", ALL) == 1
         assert "000001.bin" in (output := capsys.readouterr().out) and "3 frames" in output
-    assert len(made) == 3
+    assert len(stand_in_calls) == 3
     content = read_json(out)
     assert [frame["name"] for frame in content["frames"]] == ["000000", "000002", "000003"]
     assert "000001.bin" in content["skipped"][0]
     assert {path.stem for path in (out / "kitti").iterdir()} == {"000000", "000002", "000003"}
-    write(scan_path, content_bytes)
-    assert detect(monkeypatch, kitti, "--out", out) == 0 and len(made) == 4
+    write_file(scan_path, content_bytes)
+    assert detect(monkeypatch, kitti, "--out", out) == 0 and len(stand_in_calls) == 4
 
 
 def test_unreadable_labels_and_cameras_are_optional(kitti, tmp_path, monkeypatch, capsys):
-    write(kitti / "training/label_2/000001.txt", "Car")
+    write_file(kitti / "training/label_2/000001.txt", "Car")
     for i in 0, 2, 3:
         (kitti / f"training/calib/{i:06}.txt").unlink()
     assert detect(monkeypatch, kitti, "--out", tmp_path / "out", "--format", ALL) == 0
@@ -368,15 +368,15 @@ def test_non_finite_numbers_are_not_written(kitti, tmp_path, monkeypatch, capsys
         (["--min-score", 2], "2"),
     ],
 )
-def test_unusable_options_are_rejected(arguments, message, kitti, tmp_path, monkeypatch, capsys, made):
+def test_unusable_options_are_rejected(arguments, message, kitti, tmp_path, monkeypatch, capsys, stand_in_calls):
     assert detect(monkeypatch, kitti, "--out", tmp_path / "out", *arguments) == 2
-    assert message in capsys.readouterr().err and made == [] and not (tmp_path / "out").exists()
+    assert message in capsys.readouterr().err and stand_in_calls == [] and not (tmp_path / "out").exists()
 
 
 # Pictures and videos
 
 
-def test_pictures_and_video_show_every_frame(drives, tmp_path, monkeypatch, made):
+def test_pictures_and_video_show_every_frame(drives, tmp_path, monkeypatch, stand_in_calls):
     out, video = tmp_path / "out", tmp_path / "films/drive.gif"
     assert detect(monkeypatch, drives, "--out", out, "--png", "--video", video, "--track", "--ego", "none") == 0
     names = [frame.name for frame in open_recording(drives)]
@@ -389,15 +389,15 @@ def test_pictures_and_video_show_every_frame(drives, tmp_path, monkeypatch, made
     assert detect(monkeypatch, drives, "--out", out, "--png", "--track", "--ego", "none") == 0
     second_times = {name: (out / f"png/{name}.png").stat().st_mtime_ns for name in names}
     assert [name for name in names if second_times[name] != first_times[name]] == [names[1]]
-    assert len(made) == len(names)
+    assert len(stand_in_calls) == len(names)
 
 
-def test_unsupported_video_is_rejected_before_any_work(drives, tmp_path, monkeypatch, capsys, made):
+def test_unsupported_video_is_rejected_before_any_work(drives, tmp_path, monkeypatch, capsys, stand_in_calls):
     find_spec = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *more: None if name == "av" else find_spec(name, *more)
     )
     for name, message in ("a.mp4", "lidar_perception[video]"), ("a.avi", "is not a video"):
-        line = refused(monkeypatch, capsys, drives, "--out", tmp_path / "out", "--video", tmp_path / name)
+        line = detect_with_error(monkeypatch, capsys, drives, "--out", tmp_path / "out", "--video", tmp_path / name)
         assert message in line
-    assert made == [] and not (tmp_path / "out").exists()
+    assert stand_in_calls == [] and not (tmp_path / "out").exists()

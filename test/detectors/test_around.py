@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pointnet_samples
 import pytest
-from detection_samples import make_detector, random_detector, same, tiny
+from detection_samples import are_equal_detections, make_detector, make_random_detector, make_tiny_config
 
 from lidar_perception.classes import CAR
 from lidar_perception.clustering.cluster import cluster_obstacles
@@ -53,7 +53,9 @@ def test_rotated_cloud_has_rotated_boxes(version, street):
     detections = detector(street.frame, **columns).detections
     rotated_detections = detector(rotate_half_turn(street.frame), **columns).detections
     assert min((detections.boxes[:, 0] > 3).sum(), (detections.boxes[:, 0] < -3).sum()) > 3
-    assert same(rotated_detections, replace(detections, boxes=rotate_boxes_half_turn(detections.boxes)), atol=1e-4)
+    assert are_equal_detections(
+        rotated_detections, replace(detections, boxes=rotate_boxes_half_turn(detections.boxes)), atol=1e-4
+    )
 
 
 def test_clear_cars_are_found_behind_and_at_the_sides(street):
@@ -81,7 +83,7 @@ def test_range_around_equals_single_pass_away_from_border(street):
             for one_detector in (single_pass, detector.with_range("around"))
         )
     ]
-    assert len(detections[0]) > 3 and same(*detections)
+    assert len(detections[0]) > 3 and are_equal_detections(*detections)
 
 
 def test_range_can_be_changed_and_restored(street):
@@ -90,8 +92,8 @@ def test_range_can_be_changed_and_restored(street):
     assert detector.with_range("auto") is detector.with_range("ahead") is detector
     assert around.with_range("around") is around
     assert around.proposer.config.low == RANGES["around"]["low"]
-    assert same(around.with_range("ahead")(street.frame), detector(street.frame))
-    around_detector = random_detector(**RANGES["around"])  # one pass is enough
+    assert are_equal_detections(around.with_range("ahead")(street.frame), detector(street.frame))
+    around_detector = make_random_detector(**RANGES["around"])  # one pass is enough
     assert around_detector.with_range("around") is around_detector and len(around_detector.proposer.half_turns) == 1
 
 
@@ -104,13 +106,15 @@ def test_range_around_accepts_empty_half_and_empty_cloud(street):
 
 
 def test_unsupported_range_is_rejected():
-    config = pointnet_samples.small()
-    pointnet = PointNetDetector(pointnet_samples.make_classifier(pointnet_samples.lively(config), Header(config)))
+    config = pointnet_samples.make_small_config()
+    pointnet = PointNetDetector(
+        pointnet_samples.make_classifier(pointnet_samples.make_random_network(config), Header(config))
+    )
     assert pointnet.with_range("around") is pointnet
     with pytest.raises(InputError, match="pointnet always covers all directions"):
         pointnet.with_range("ahead")
     with pytest.raises(InputError, match="does not support the range around: a grid of"):
-        random_detector(low=(0.0, -3.52, -3.0), high=(7.04, 3.52, 1.0), cell=0.22).with_range("around")
-    exported = make_detector(SimpleNamespace(has_fixed_range=True), Header(tiny()))
+        make_random_detector(low=(0.0, -3.52, -3.0), high=(7.04, 3.52, 1.0), cell=0.22).with_range("around")
+    exported = make_detector(SimpleNamespace(has_fixed_range=True), Header(make_tiny_config()))
     with pytest.raises(InputError, match="use the checkpoint for the range around"):
         exported.with_range("around")

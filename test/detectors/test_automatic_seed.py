@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from candidate_samples import floor, person
+from candidate_samples import make_floor, make_person
 
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.params import SeedParams
@@ -45,7 +45,7 @@ def test_automatic_seed_does_not_depend_on_sensor_height(scan):
 
 
 @pytest.mark.parametrize(
-    "xyz", [np.zeros((0, 3)), floor(), person(6, 0, count=9)], ids=["empty", "only ground", "nine points"]
+    "xyz", [np.zeros((0, 3)), make_floor(), make_person(6, 0, count=9)], ids=["empty", "only ground", "nine points"]
 )
 def test_clouds_without_a_person_have_no_seed_and_no_candidates(xyz):
     params = with_values(PARAMS, {"clustering.dbscan.min_samples": 3, "seed.min_confidence": 0.0})

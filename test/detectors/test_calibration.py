@@ -9,11 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from detection_samples import eager, frame, lively, random_detector, same, tiny
+from detection_samples import (
+    are_equal_detections,
+    lower_thresholds,
+    make_random_detector,
+    make_random_network,
+    make_scan,
+    make_tiny_config,
+)
 from hypothesis import given
 from hypothesis import strategies as st
-from pointnet_samples import random_detector as random_pointnet
-from samples import object_folder
+from pointnet_samples import make_random_detector as random_pointnet
+from samples import write_object_folder
 
 from lidar_perception.detectors.calibration import calibrate_scores, to_raw_score
 from lidar_perception.detectors.checkpoint import Header, read_checkpoint, read_header, save_checkpoint, save_header
@@ -43,16 +50,18 @@ def test_calibration_keeps_order_and_is_invertible(scores, slope, offset):
 
 
 @pytest.mark.parametrize(
-    "make", [lambda: random_detector("v4", eager(score=0.0)), random_pointnet], ids=["PointPillars", "PointNet"]
+    "make",
+    [lambda: make_random_detector("v4", lower_thresholds(score=0.0)), random_pointnet],
+    ids=["PointPillars", "PointNet"],
 )
 def test_calibration_does_not_change_the_boxes(make):
-    detector, scan = make().with_min_score(0.0), frame()
+    detector, scan = make().with_min_score(0.0), make_scan()
     raw_detections = detector(scan).detections
     (network,) = detector.networks
     network.header = replace(network.header, calibration=LINES)
     detections = detector(scan).detections
-    assert len(detections) and same(detections, calibrate_scores(raw_detections, LINES), atol=1e-6)
-    assert same(detector.with_raw_scores()(scan), raw_detections)
+    assert len(detections) and are_equal_detections(detections, calibrate_scores(raw_detections, LINES), atol=1e-6)
+    assert are_equal_detections(detector.with_raw_scores()(scan), raw_detections)
     median_score = float(np.median(detections.scores))
     # Weak boxes do not suppress strong ones, so a threshold only removes weak boxes.
     strong_detections = detector.with_min_score(median_score)(scan).detections
@@ -77,16 +86,16 @@ def test_calibration_does_not_change_the_boxes(make):
     ],
 )
 def test_invalid_calibration_is_rejected(tmp_path, calibration):
-    header = Header(tiny("v0"), calibration=calibration)
-    save_checkpoint(tmp_path / "w.safetensors", lively(tiny("v0")), header)
+    header = Header(make_tiny_config("v0"), calibration=calibration)
+    save_checkpoint(tmp_path / "w.safetensors", make_random_network(make_tiny_config("v0")), header)
     with pytest.raises(InputError, match="invalid calibration"):
         read_header(tmp_path / "w.safetensors")
 
 
 @pytest.mark.parametrize("half", [False, True])
 def test_save_header_does_not_change_the_weights(tmp_path, half):
-    path, config = tmp_path / "some.safetensors", tiny()
-    save_checkpoint(path, lively(config), Header(config, calibration=LINES), half)
+    path, config = tmp_path / "some.safetensors", make_tiny_config()
+    save_checkpoint(path, make_random_network(config), Header(config, calibration=LINES), half)
     _, original = read_checkpoint(path, type(config))
     save_header(path, Header(config, calibration={"Car": (1.0, 0.0)}))
     header, stored = read_checkpoint(path, type(config))
@@ -95,6 +104,6 @@ def test_save_header_does_not_change_the_weights(tmp_path, half):
     # scans without enough objects give no calibration, so the file keeps its own
     content = path.read_bytes()
     script = runpy.run_path(str(Path(__file__).parents[2] / "scripts/calibrate_weights.py"))
-    result = CliRunner().invoke(script["main"], [str(object_folder(tmp_path / "scans", count=1)), str(path)])
+    result = CliRunner().invoke(script["main"], [str(write_object_folder(tmp_path / "scans", count=1)), str(path)])
     assert result.exit_code == 1 and "too few correct or wrong detections of Car" in result.output
     assert path.read_bytes() == content

@@ -8,10 +8,10 @@ import detection_samples
 import numpy as np
 import pointnet_samples
 import pytest
-from detection_samples import same
+from detection_samples import are_equal_detections
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import CALIBRATION, crowd
+from samples import CALIBRATION, make_crowd
 
 from experiments.comparison.contenders import open_contenders
 from lidar_perception.classes import CAR
@@ -31,7 +31,7 @@ each_name = pytest.mark.parametrize("name", NAMES)
 
 @pytest.fixture(scope="module")
 def frame():
-    cloud, truth = crowd(1)
+    cloud, truth = make_crowd(1)
     return Frame.of("crowd", PointCloud(cloud[:, :3].copy(), cloud[:, 3].copy()), truth, CALIBRATION)
 
 
@@ -40,10 +40,10 @@ def detectors(frame, tmp_path_factory):
     """Return the detector of every contender by name, with random networks."""
     folder = tmp_path_factory.mktemp("weights")
     for name, samples, config in (
-        ("a", detection_samples, detection_samples.tiny()),
-        ("b", pointnet_samples, pointnet_samples.small()),
+        ("a", detection_samples, detection_samples.make_tiny_config()),
+        ("b", pointnet_samples, pointnet_samples.make_small_config()),
     ):
-        save_checkpoint(folder / name, samples.lively(config), Header(config))
+        save_checkpoint(folder / name, samples.make_random_network(config), Header(config))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(weights_file, "POINTPILLARS_WEIGHTS", folder / "none")
         patch.setattr(weights_file, "POINTNET_WEIGHTS", folder / "none")
@@ -73,11 +73,13 @@ def test_array_and_frame_give_equal_detections(detectors, frame, name):
     """Columns have a value for every row, including unusable points."""
     scan, detector = frame.load(), detectors[name]
     cloud, ground = scan.points(), scan.xyz[:, 2] < -1.5
-    assert same(detector(cloud), detector(scan))
+    assert are_equal_detections(detector(cloud), detector(scan))
     expected = detector(scan, ground=ground)
     invalid_cloud = np.insert(cloud, [0, 50], [[np.nan] * 4, [0, 0, 0, 1]], axis=0)
-    assert same(detector(invalid_cloud, ground=np.insert(ground, [0, 50], True)), expected)
-    assert same(detector(invalid_cloud.tolist(), ground=np.insert(ground, [0, 50], True).tolist()), expected)
+    assert are_equal_detections(detector(invalid_cloud, ground=np.insert(ground, [0, 50], True)), expected)
+    assert are_equal_detections(
+        detector(invalid_cloud.tolist(), ground=np.insert(ground, [0, 50], True).tolist()), expected
+    )
     if "STM-CPA" not in name or "auto" in name:  # the others have no seed in this frame
         assert len(detector([]).detections) == 0 and detector(np.full((9, 3), np.nan)).problem
     for argument, message in ((np.ones((5, 5)), r"points\[:, :4\]"), (frame, "frame.load"), (None, "NoneType")):
@@ -92,7 +94,7 @@ def test_other_intensity_scale_is_reported_and_normalized(detectors, frame, name
     assert scan.intensity.max() > 0.5
     points = np.column_stack([scan.xyz, np.round(scan.intensity * full_scale)])
     result, expected = detector(points), detector(PointCloud.of(points, intensity_max=full_scale))
-    assert same(result.detections, expected.detections)
+    assert are_equal_detections(result.detections, expected.detections)
     if name.startswith("STM-CPA") and "PointNet" not in name:  # these do not use intensity
         assert result.problem == expected.problem
     else:
@@ -153,7 +155,7 @@ def test_second_call_gives_equal_result_for_unchanged_frame(detectors, frame, na
     scan = frame.load()
     original = scan.xyz.copy(), scan.intensity.copy()
     result, second_result = (detectors[name](scan) for _ in range(2))
-    assert isinstance(result, DetectionResult) and same(result, second_result)
+    assert isinstance(result, DetectionResult) and are_equal_detections(result, second_result)
     assert (result.problem, result.best) == (second_result.problem, second_result.best)
     assert result.timings.keys() == second_result.timings.keys()
     assert {CLASSES[i] for i in result.detections.class_ids} <= set(detectors[name].classes)
@@ -169,7 +171,7 @@ def test_with_min_score_returns_a_copy(detectors, frame, name):
     assert type(strict_detector) is type(detector) and strict_detector.classes == detector.classes
     assert set(strict_detector.min_scores.values()) == {0.6}
     assert (strict_detector(scan).detections.scores >= np.float32(0.6)).all()
-    assert dict(detector.min_scores) == scores and same(detector(scan), result)
+    assert dict(detector.min_scores) == scores and are_equal_detections(detector(scan), result)
     assert len(result.detections) > 0 or result.best
 
 

@@ -10,7 +10,14 @@ import random
 import numpy as np
 import pytest
 import torch
-from detection_samples import eager, frame, lively, make_detector, same, tiny
+from detection_samples import (
+    are_equal_detections,
+    lower_thresholds,
+    make_detector,
+    make_random_network,
+    make_scan,
+    make_tiny_config,
+)
 from safetensors.torch import save
 
 from lidar_perception.detectors.checkpoint import KEY, Header, read_header
@@ -100,7 +107,12 @@ def mutate(header, rng):
 
 
 SMALL = {
-    "pointpillars": (lambda: Header(tiny("v4"), {"steps": 1}, {"map": 0.5}, "abc"), lively, load_detector, eager()),
+    "pointpillars": (
+        lambda: Header(make_tiny_config("v4"), {"steps": 1}, {"map": 0.5}, "abc"),
+        make_random_network,
+        load_detector,
+        lower_thresholds(),
+    ),
     "pointnet": (
         lambda: Header(
             make_pointnet_config(points=16, centroids=8, coarse=4, neighbours=(4, 4, 4), coarse_neighbours=4)
@@ -119,7 +131,7 @@ def test_mutated_header_is_accepted_or_rejected_in_one_line(network_name, tmp_pa
     header = make_header()
     tensors = make(header.config).state_dict()
     path, text, rng = tmp_path / "w.safetensors", json.loads(header.to_json()), random.Random(7)
-    scan, rejected_count = frame(), 0
+    scan, rejected_count = make_scan(), 0
     texts = [json.dumps(mutate(text, rng)) for _ in range(60)]
     texts += [
         "[" * 100_000,
@@ -146,23 +158,23 @@ def test_large_header_does_not_allocate_memory(tmp_path):
     header = json.loads(SMALL["pointpillars"][0]().to_json())
     header["config"]["block_channels"] = [65_536, 65_536, 65_536]  # 300 GB of weights
     path = tmp_path / "w.safetensors"
-    write_checkpoint(path, lively(tiny("v4")).state_dict(), json.dumps(header))
+    write_checkpoint(path, make_random_network(make_tiny_config("v4")).state_dict(), json.dumps(header))
     with pytest.raises(InputError, match="do not match"):
         load_detector(path, "cpu")
     header["config"].update(low=[-60_000, -60_000, -3], high=[60_000, 60_000, 1], cell=0.01)
-    write_checkpoint(path, lively(tiny("v4")).state_dict(), json.dumps(header))
+    write_checkpoint(path, make_random_network(make_tiny_config("v4")).state_dict(), json.dumps(header))
     with pytest.raises(InputError, match="cells"):
         load_detector(path, "cpu")
 
 
 def test_constant_scores_are_reported_as_broken_weights():
-    config = tiny("v4")
+    config = make_tiny_config("v4")
     for value in 0.0, 1.0:
-        network = lively(config)
+        network = make_random_network(config)
         for tensor in network.state_dict().values():
             tensor.fill_(0)
         network.head.scores.bias.fill_(value)
-        result = make_detector(TorchNetwork(network), Header(config), eager(score=0.1))(frame())
+        result = make_detector(TorchNetwork(network), Header(config), lower_thresholds(score=0.1))(make_scan())
         assert len(result.detections) == 0 and "scores are the same" in result.problem
 
 
@@ -172,7 +184,7 @@ def test_onnx_files_with_other_inputs_are_rejected(tmp_path):
     pytest.importorskip("onnxruntime", reason="needs the extra [onnx]")
     from onnx import TensorProto, helper
 
-    text = Header(tiny("v0")).to_json()
+    text = Header(make_tiny_config("v0")).to_json()
 
     def model(path, inputs, outputs=("logits", "codes", "directions"), header=text):
         nodes = [
@@ -209,21 +221,23 @@ def test_onnx_files_with_other_inputs_are_rejected(tmp_path):
     ):  # outputs of impossible shapes
         model(path, **change)
         with pytest.raises(InputError, match=message) as error:
-            load_detector(path, "cpu")(frame())
+            load_detector(path, "cpu")(make_scan())
         assert "\n" not in str(error.value)
 
 
 def test_tensors_of_other_types_are_rejected(tmp_path):
-    config = tiny("v4")
-    path, state = tmp_path / "w.safetensors", lively(config).state_dict()
+    config = make_tiny_config("v4")
+    path, state = tmp_path / "w.safetensors", make_random_network(config).state_dict()
     for dtype in torch.bool, torch.int8, torch.complex64:
         write_checkpoint(path, {name: value.to(dtype) for name, value in state.items()}, Header(config).to_json())
         with pytest.raises(InputError, match="expected floats of shape"):
-            load_detector(path, "cpu", eager())
+            load_detector(path, "cpu", lower_thresholds())
     write_checkpoint(
         path,
         {name: value.double() if value.is_floating_point() else value for name, value in state.items()},
         Header(config).to_json(),
     )
-    expected = make_detector(TorchNetwork(lively(config)), Header(config), eager())
-    assert same(load_detector(path, "cpu", eager(engine="torch"))(frame()), expected(frame()))
+    expected = make_detector(TorchNetwork(make_random_network(config)), Header(config), lower_thresholds())
+    assert are_equal_detections(
+        load_detector(path, "cpu", lower_thresholds(engine="torch"))(make_scan()), expected(make_scan())
+    )

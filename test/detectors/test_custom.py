@@ -6,7 +6,7 @@ from importlib.metadata import EntryPoint
 
 import numpy as np
 import pytest
-from samples import scene
+from samples import make_scene
 
 from experiments.comparison.contenders import _make_name
 from lidar_perception.detectors import custom
@@ -56,24 +56,24 @@ def module(tmp_path, monkeypatch):
 def test_own_detector_receives_sensor_height_and_device(module):
     detector = open_detector(f"{module}:Fixed", "cpu", sensor_height=0.5)
     assert detector.classes == ("Pedestrian", "Car")
-    result = detector(scene(0))
+    result = detector(make_scene(0))
     assert result.detections.boxes[0, 5] == 0.5
     higher_detector = detector.with_sensor_height(2.0)
-    assert higher_detector(scene(0)).detections.boxes[0, 5] == 2.0
-    assert detector(scene(0)).detections.boxes[0, 5] == 0.5
+    assert higher_detector(make_scene(0)).detections.boxes[0, 5] == 2.0
+    assert detector(make_scene(0)).detections.boxes[0, 5] == 0.5
     assert detector.build(0.5).device == "cpu" and detector.build(0.5) is detector.build(0.5)
 
 
 def test_detections_below_the_threshold_are_dropped(module):
     detector = open_detector(f"{module}:Fixed")
-    assert len(detector(scene(0)).detections) == 2 and detector.min_scores["Car"] == 0.0
-    assert len(detector.with_min_score(0.5)(scene(0)).detections) == 1
+    assert len(detector(make_scene(0)).detections) == 2 and detector.min_scores["Car"] == 0.0
+    assert len(detector.with_min_score(0.5)(make_scene(0)).detections) == 1
     strict_detector = open_detector(f"{module}:Fixed", settings={"custom.scores.pedestrian": 0.95})
-    assert strict_detector(scene(0)).detections.class_ids.tolist() == [0]
+    assert strict_detector(make_scene(0)).detections.class_ids.tolist() == [0]
 
 
 def test_own_detector_receives_cropped_finite_points(module):
-    cloud = scene(0)
+    cloud = make_scene(0)
     cloud[:5] = np.nan
     point_count = open_detector(f"{module}:Fixed")(cloud).detections.boxes[1, 5]
     assert point_count == len(cloud) - 5
@@ -106,14 +106,14 @@ def test_range_is_rejected_if_the_class_has_no_such_argument(module):
 
 def test_wrong_return_type_of_own_detector_ends_the_run(module):
     with pytest.raises(RunError, match="returned ndarray instead of Detections"):
-        open_detector(f"{module}:Returns")(scene(0))
+        open_detector(f"{module}:Returns")(make_scene(0))
 
 
 def test_entry_point_names_a_class(module, monkeypatch):
     points = [EntryPoint("mine", f"{module}:Fixed", custom.ENTRY_POINTS)]
     monkeypatch.setattr(custom, "entry_points", lambda group: points)
     assert resolve_weights("mine") == ("mine", None)
-    assert len(open_detector("mine")(scene(0)).detections) == 2
+    assert len(open_detector("mine")(make_scene(0)).detections) == 2
     assert make_default_params("mine") == custom.CustomDetectorParams()
     with pytest.raises(InputError, match=r"Valid names: .*, mine"):
         open_detector("mime")
@@ -121,7 +121,7 @@ def test_entry_point_names_a_class(module, monkeypatch):
 
 def test_function_becomes_a_detector():
     detector = custom.as_detector(lambda cloud: Detections.of([1, 0, 0, 1, 1, 1, 0], 3, 0.5))
-    assert len(detector(scene(0)).detections) == 1
+    assert len(detector(make_scene(0)).detections) == 1
     assert custom.as_detector(detector) is detector
 
 

@@ -7,7 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from detection_samples import BOXES, LABELS, anchor_tensors, lively, tiny, two_objects
+from detection_samples import (
+    BOXES,
+    LABELS,
+    make_anchor_tensors,
+    make_random_network,
+    make_tiny_config,
+    make_two_objects,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -108,7 +115,7 @@ def test_error_for_another_network_shows_both_values():
 
 
 def test_pillars_contain_their_points():
-    config = tiny("v0")
+    config = make_tiny_config("v0")
     points = make_points(config, margin=1.0)
     points[3, 0], points[4, 2], points[5, 3] = torch.nan, torch.inf, torch.nan
     pillars = make_pillar_batch([points], config)
@@ -138,8 +145,8 @@ def test_keep_first_per_cell_equals_a_loop(seed, max_count):
 
 
 def test_order_of_the_points_does_not_matter():
-    config = tiny("v0")
-    network, points = lively(config), make_points(config)
+    config = make_tiny_config("v0")
+    network, points = make_random_network(config), make_points(config)
     image = network.pillar_net(make_pillar_batch([points], config))
     shuffled = network.pillar_net(make_pillar_batch([points[torch.randperm(len(points))]], config))
     torch.testing.assert_close(shuffled, image, atol=1e-5, rtol=1e-5)
@@ -147,8 +154,8 @@ def test_order_of_the_points_does_not_matter():
 
 
 def test_points_stay_float32_in_mixed_precision():
-    config = tiny()
-    network = lively(config)
+    config = make_tiny_config()
+    network = make_random_network(config)
     pillars = make_pillar_batch([make_points(config)], config)
     expected = network.pillar_net(pillars)
     with torch.autocast("cpu", torch.bfloat16):
@@ -157,19 +164,19 @@ def test_points_stay_float32_in_mixed_precision():
 
 
 def test_bf16_network_agrees_with_float32():
-    config = tiny()
+    config = make_tiny_config()
     pillars = make_pillars(make_points(config).numpy(), config)
     outputs = {}
     for amp in ("off", "bf16"):
-        logits, compute_boxes, _ = TorchNetwork(lively(config), amp=amp)(pillars, None)
+        logits, compute_boxes, _ = TorchNetwork(make_random_network(config), amp=amp)(pillars, None)
         outputs[amp] = np.column_stack([logits, *compute_boxes(np.arange(len(logits)))])
     assert outputs["bf16"].dtype == np.float32 and not np.array_equal(outputs["bf16"], outputs["off"])
     assert np.abs(outputs["bf16"] - outputs["off"]).max() < 0.05 * np.abs(outputs["off"]).max()
 
 
 def test_shift_by_one_pillar_shifts_image_by_one_cell():
-    config = tiny("v0", low=(0.0, -4.0, -3.0), high=(8.0, 4.0, 1.0), cell=0.25)
-    network = lively(config)
+    config = make_tiny_config("v0", low=(0.0, -4.0, -3.0), high=(8.0, 4.0, 1.0), cell=0.25)
+    network = make_random_network(config)
     network.pillar_net.linear.weight[:, :2] = 0  # x and y themselves
     points = (make_points(config) * 64).round() / 64  # so that shifts are exact
     points = points[(points[:, 0] < 7.5) & (points[:, 1] < 3.5)]
@@ -182,8 +189,11 @@ def test_shift_by_one_pillar_shifts_image_by_one_cell():
 
 
 def test_scaled_x_and_y_equal_scaled_weights():
-    config = tiny("v2", xy_scale=1.0)
-    network, scaled_network = lively(config), lively(dataclasses.replace(config, xy_scale=0.125))
+    config = make_tiny_config("v2", xy_scale=1.0)
+    network, scaled_network = (
+        make_random_network(config),
+        make_random_network(dataclasses.replace(config, xy_scale=0.125)),
+    )
     scaled_network.load_state_dict(network.state_dict())
     pillars = make_pillar_batch([make_points(config)], config)
     assert not torch.allclose(scaled_network.pillar_net(pillars), network.pillar_net(pillars), atol=0.1)
@@ -193,8 +203,8 @@ def test_scaled_x_and_y_equal_scaled_weights():
 
 @pytest.mark.parametrize("middle_z", [False, True])
 def test_removing_padding_pillars_keeps_the_result(middle_z):
-    config = tiny("v0", max_points=2, zero_row=True, middle_z=middle_z, xy_scale=1.0)
-    network, points = lively(config), make_points(config, 900)
+    config = make_tiny_config("v0", max_points=2, zero_row=True, middle_z=middle_z, xy_scale=1.0)
+    network, points = make_random_network(config), make_points(config, 900)
     net, low = network.pillar_net, torch.tensor(config.low)
     image = net(make_pillar_batch([points], config))[0]
     expected = torch.zeros_like(image)
@@ -221,8 +231,8 @@ def test_removing_padding_pillars_keeps_the_result(middle_z):
 @each_version
 @pytest.mark.parametrize("changes", [{}, dict(fusion="concat"), dict(block_strides=(1, 2, 2))])
 def test_every_version_has_outputs_for_all_anchors(version, changes):
-    config = tiny(version, **changes)
-    count = len(anchor_tensors(config)[0])
+    config = make_tiny_config(version, **changes)
+    count = len(make_anchor_tensors(config)[0])
     assert count == config.head_grid[0] * config.head_grid[1] * 6
     pillars = make_pillar_batch([make_points(config), make_points(config, 9)], config)
     outputs = make_network(config)(pillars, torch.cat([make_map(config)] * 2) if config.pseudo_map else None)
@@ -232,8 +242,8 @@ def test_every_version_has_outputs_for_all_anchors(version, changes):
 
 @each_version
 def test_batch_of_two_equals_two_single_clouds(version):
-    config = tiny(version)
-    network = lively(config)
+    config = make_tiny_config(version)
+    network = make_random_network(config)
     clouds = [make_points(config, 300, 1), make_points(config, 500, 2)]
     maps = [make_map(config, 1), make_map(config, 2)]
     batch_outputs = network(make_pillar_batch(clouds, config), torch.cat(maps) if config.pseudo_map else None)
@@ -246,8 +256,8 @@ def test_batch_of_two_equals_two_single_clouds(version):
 
 @each_version
 def test_folded_norms_give_equal_outputs(version):
-    config = tiny(version)
-    network = lively(config)
+    config = make_tiny_config(version)
+    network = make_random_network(config)
     pillars, cluster_map = make_pillar_batch([make_points(config)], config), make_map(config)
     folded = fuse_norms(network)
     for a, b in zip(network(pillars, cluster_map), folded(pillars, cluster_map)):
@@ -256,8 +266,8 @@ def test_folded_norms_give_equal_outputs(version):
 
 
 def test_boxes_of_selected_anchors_equal_those_of_all():
-    config = tiny("v1")
-    network = lively(config)
+    config = make_tiny_config("v1")
+    network = make_random_network(config)
     features = network.compute_features(make_pillar_batch([make_points(config)], config))
     outputs, indices = network.head(features), torch.tensor([0, 5, 17, 100, 1535])
     codes, directions = network.head.compute_boxes(features, indices)
@@ -267,15 +277,15 @@ def test_boxes_of_selected_anchors_equal_those_of_all():
 
 
 def test_tiny_network_learns_two_objects():
-    config = tiny("v0", block_channels=(16, 24, 24), deconv_channels=16, pillar_channels=16)
+    config = make_tiny_config("v0", block_channels=(16, 24, 24), deconv_channels=16, pillar_channels=16)
     torch.manual_seed(0)
     network = make_network(config)
     for module in network.modules():
         if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
             module.momentum = 0.1
-    anchors, anchor_classes = anchor_tensors(config)
+    anchors, anchor_classes = make_anchor_tensors(config)
     targets = assign_targets(anchors, config, BOXES, LABELS)
-    points = torch.from_numpy(two_objects())
+    points = torch.from_numpy(make_two_objects())
     optimizer = torch.optim.AdamW(network.parameters())
     scheduler = torch.optim.lr_scheduler.OneCycleLR(optimizer, 0.02, total_steps=200)
     for _ in range(200):
@@ -310,7 +320,7 @@ def test_tiny_network_learns_two_objects():
 
 @pytest.mark.parametrize("changes", [{}, dict(version="v2"), dict(max_points=3, middle_z=True)])
 def test_pillars_of_single_and_batched_clouds_are_equal(changes):
-    config = tiny(**changes)
+    config = make_tiny_config(**changes)
     rng = np.random.default_rng(0)
     low, high = np.array(config.low), np.array(config.high)
     points = rng.uniform([*(low - 0.5), 0], [*(high + 0.5), 1], (5000, 4)).astype(np.float32)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from detection_samples import BOXES, LABELS, anchor_tensors, tiny
+from detection_samples import BOXES, LABELS, make_anchor_tensors, make_tiny_config
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -43,8 +43,8 @@ def make_boxes(seed, count=20, spread=6.0) -> np.ndarray:
 
 
 def test_anchor_order_is_y_x_class_yaw():
-    config = tiny("v0")
-    anchors, anchor_classes = anchor_tensors(config)
+    config = make_tiny_config("v0")
+    anchors, anchor_classes = make_anchor_tensors(config)
     height, width = config.head_grid
     grid = anchors.view(height, width, 3, 2, 7)
     assert torch.equal(anchor_classes.view(height, width, 3, 2)[2, 3].T, torch.arange(3).expand(2, 3))
@@ -53,7 +53,7 @@ def test_anchor_order_is_y_x_class_yaw():
     for i, spec in enumerate(ANCHORS):
         assert grid[1, 1, i, :, 3:6].tolist() == [pytest.approx(spec.size)] * 2
         assert grid[1, 1, i, 0, 2] - spec.size[2] / 2 == pytest.approx(-1.73)  # on the ground
-    ends = anchor_tensors(tiny("v0", anchors_at="ends"))[0].view(height, width, 3, 2, 7)
+    ends = make_anchor_tensors(make_tiny_config("v0", anchors_at="ends"))[0].view(height, width, 3, 2, 7)
     assert (ends[0, 0, 0, 0, :2].tolist(), ends[-1, -1, 0, 0, :2].tolist()) == (
         [0.0, pytest.approx(-5.12)],
         [pytest.approx(10.24), pytest.approx(5.12)],
@@ -85,8 +85,8 @@ def test_axis_aligned_iou_equals_textbook_formula():
 
 
 def test_targets_equal_a_plain_implementation():
-    config = tiny("v0")
-    anchors, classes = anchor_tensors(config)
+    config = make_tiny_config("v0")
+    anchors, classes = make_anchor_tensors(config)
     rng = np.random.default_rng(3)
     sizes = torch.tensor([a.size for a in config.anchors])
     labels = torch.from_numpy(rng.integers(0, 3, 8))
@@ -120,8 +120,8 @@ def test_targets_equal_a_plain_implementation():
 
 @given(seeds)
 def test_distant_anchors_have_no_overlap(seed):
-    config = tiny()
-    anchors, anchor_classes = anchor_tensors(config)
+    config = make_tiny_config()
+    anchors, anchor_classes = make_anchor_tensors(config)
     boxes = torch.from_numpy(make_boxes(seed, 6, 12.0)).float()
     for index in range(len(config.anchors)):
         near_anchors = find_near_anchors(anchors, config, boxes, index)
@@ -133,8 +133,8 @@ def test_distant_anchors_have_no_overlap(seed):
 
 
 def test_every_object_has_an_anchor_in_any_order():
-    config = tiny("v0")
-    anchors = anchor_tensors(config)[0]
+    config = make_tiny_config("v0")
+    anchors = make_anchor_tensors(config)[0]
     targets = assign_targets(anchors, config, BOXES, LABELS)
     reversed_targets = assign_targets(anchors, config, BOXES.flip(0), LABELS.flip(0))
     for a, b in zip(targets, reversed_targets):
@@ -155,11 +155,11 @@ def test_every_object_has_an_anchor_in_any_order():
 
 
 def test_targets_without_valid_objects_are_background():
-    config = tiny("v0")
+    config = make_tiny_config("v0")
     invalid_boxes = BOXES.clone()
     invalid_boxes[0, 3], invalid_boxes[1, 0] = 0, torch.nan
     for boxes, labels in (invalid_boxes, LABELS), (BOXES[:0], LABELS[:0]):
-        assert (assign_targets(anchor_tensors(config)[0], config, boxes, labels).labels == BACKGROUND).all()
+        assert (assign_targets(make_anchor_tensors(config)[0], config, boxes, labels).labels == BACKGROUND).all()
 
 
 # losses
@@ -175,9 +175,9 @@ def make_outputs(targets, classes=3, margin=12.0):
 
 
 def test_loss_is_zero_for_targets_and_positive_for_errors():
-    config = tiny("v0")
-    anchor_classes = anchor_tensors(config)[1]
-    targets = assign_targets(anchor_tensors(config)[0], config, BOXES, LABELS)
+    config = make_tiny_config("v0")
+    anchor_classes = make_anchor_tensors(config)[1]
+    targets = assign_targets(make_anchor_tensors(config)[0], config, BOXES, LABELS)
     exact_outputs = make_outputs(targets)
     assert compute_detection_loss(exact_outputs, targets, anchor_classes).total < 1e-4
     flipped_outputs = exact_outputs._replace(codes=exact_outputs.codes + torch.tensor([0, 0, 0, 0, 0, 0, np.pi]))
@@ -206,8 +206,8 @@ def make_batch(clouds: list[Targets]) -> Targets:
 
 
 def test_sparse_targets_survive_conversion_to_dense():
-    config = tiny("v0")
-    anchors = anchor_tensors(config)[0]
+    config = make_tiny_config("v0")
+    anchors = make_anchor_tensors(config)[0]
     clouds = [assign_targets(anchors, config, BOXES[:n], LABELS[:n]) for n in (2, 0, 1)]
     assert {BACKGROUND, IGNORED, *range(2)} <= set(clouds[0].labels.flatten().tolist())
     for dense, *single_clouds in zip(make_batch(clouds), *clouds):
@@ -215,8 +215,8 @@ def test_sparse_targets_survive_conversion_to_dense():
 
 
 def test_doubling_the_batch_keeps_the_loss():
-    config = tiny("v0")
-    anchors, anchor_classes = anchor_tensors(config)
+    config = make_tiny_config("v0")
+    anchors, anchor_classes = make_anchor_tensors(config)
     targets, outputs = assign_targets(anchors, config, BOXES, LABELS), make_random_outputs(anchors)
     single_loss = compute_detection_loss(outputs, targets, anchor_classes)
     double_loss = compute_detection_loss(
@@ -234,8 +234,8 @@ def test_doubling_the_batch_keeps_the_loss():
 
 
 def test_classes_have_equal_weight_for_any_number_of_anchors():
-    config = tiny("v0")
-    anchors, anchor_classes = anchor_tensors(config)
+    config = make_tiny_config("v0")
+    anchors, anchor_classes = make_anchor_tensors(config)
     targets, outputs = assign_targets(anchors, config, BOXES, LABELS), make_random_outputs(anchors, 2)
     targets = make_batch([targets, assign_targets(anchors, config, BOXES[:1], LABELS[:1])])
     class_losses = []

@@ -7,7 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from detection_samples import eager, frame, lively, make_detector, random_detector, same, tiny
+from detection_samples import (
+    are_equal_detections,
+    lower_thresholds,
+    make_detector,
+    make_random_detector,
+    make_random_network,
+    make_scan,
+    make_tiny_config,
+)
 
 from lidar_perception.clustering.cluster import cluster
 from lidar_perception.clustering.density import measure_density
@@ -24,7 +32,7 @@ from lidar_perception.ground.segment import level_points, segment_ground
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, Detections, InputError, PointCloud
 
-pytestmark = pytest.mark.usefixtures("one_thread", "carrier_too")
+pytestmark = pytest.mark.usefixtures("one_thread", "keep_ego_detections")
 each_version = pytest.mark.parametrize("version", VERSIONS)
 
 
@@ -52,8 +60,8 @@ def test_view_includes_low_and_excludes_high():
 
 @each_version
 def test_given_columns_equal_computed_columns(version):
-    detector = random_detector(version)
-    scan = frame()
+    detector = make_random_detector(version)
+    scan = make_scan()
     config = detector.proposer.config
     view = NormalizedView.of(scan, low=config.low, high=config.high)
     indices, view_frame = view.indices, view.frame
@@ -67,14 +75,14 @@ def test_given_columns_equal_computed_columns(version):
     computed = detector(scan)
     assert len(computed.detections) > 3
     for columns in (ground, None), (None, ids), (ground.astype(np.uint8), ids):
-        assert same(detector(scan, ground=columns[0], cluster_ids=columns[1]), computed)
+        assert are_equal_detections(detector(scan, ground=columns[0], cluster_ids=columns[1]), computed)
 
 
 def test_versions_have_the_inputs_of_the_paper():
-    scan = frame()
+    scan = make_scan()
     inputs = {}
     for version in VERSIONS:
-        config = tiny(version)
+        config = make_tiny_config(version)
         view_frame = NormalizedView.of(scan, low=config.low, high=config.high).frame
         inputs[version] = make_network_input(view_frame, config)
     ground = segment_ground(view_frame, EXPERT_GROUND)
@@ -99,7 +107,7 @@ MAP_CLASSES = ("Car", "Cyclist", "Pedestrian")  # by the channels of paper B
 
 
 def test_cluster_map_equals_a_plain_loop_over_cells():
-    config = tiny("v4", cell=0.16)
+    config = make_tiny_config("v4", cell=0.16)
     rng = np.random.default_rng(4)
     centres = rng.uniform([0, -6, 0], [10.5, 6, 0], (25, 3))
     spread = np.linspace(0.02, 3, 25)[:, None, None]
@@ -125,7 +133,7 @@ def test_cluster_map_equals_a_plain_loop_over_cells():
 
 
 def test_cluster_of_collinear_points_is_drawn_at_its_centre():
-    config = tiny("v4")
+    config = make_tiny_config("v4")
     xyz = np.float32([[4.1, 1.1, -1], [4.5, 1.1, -0.5], [4.9, 1.1, 0]])
     image = draw_clusters(xyz, np.ones(3, np.int32), config)
     assert np.argwhere(image).tolist() == [[MAP_CLASSES.index("Pedestrian"), int(6.22 / 0.32), int(4.5 / 0.32)]]
@@ -135,7 +143,7 @@ def test_cluster_of_collinear_points_is_drawn_at_its_centre():
 
 
 def test_view_does_not_depend_on_sensor_height():
-    config, rng = tiny(), np.random.default_rng(0)
+    config, rng = make_tiny_config(), np.random.default_rng(0)
     scan = PointCloud(rng.uniform([-2, -7, -6], [12, 7, 5], (500, 3)).astype(np.float32))
     view = NormalizedView.of(scan, low=config.low, high=config.high)
     higher_scan = replace(scan, xyz=scan.xyz - np.float32([0, 0, 0.5]))
@@ -147,8 +155,8 @@ def test_view_does_not_depend_on_sensor_height():
 
 
 def test_detections_pass_thresholds_sorted_without_overlap():
-    detector = random_detector("v4")
-    result = detector(frame())
+    detector = make_random_detector("v4")
+    result = detector(make_scan())
     detections = result.detections
     assert (np.diff(detections.scores) <= 0).all() and (detections.scores >= 0.25).all()
     assert {*detections.class_ids} <= {CLASSES.index(n) for n in detector.classes}
@@ -157,19 +165,21 @@ def test_detections_pass_thresholds_sorted_without_overlap():
     median_score = float(np.median(detections.scores[detections.class_ids == detections.class_ids[0]]))
     name = CLASSES[detections.class_ids[0]].lower()
     detector.params = with_values(detector.params, {f"pointpillars.scores.{name}": median_score})
-    remaining = detector(frame()).detections
+    remaining = detector(make_scan()).detections
     assert remaining.scores[remaining.class_ids == detections.class_ids[0]].min() >= median_score
     detector.params = with_values(detector.params, {"pointpillars.nms.max_boxes": 2})
-    assert same(detector(frame()), remaining[:2])
+    assert are_equal_detections(detector(make_scan()), remaining[:2])
 
 
 def test_sensor_height_changes_only_z_of_boxes():
-    detector = random_detector("v4")
-    scan, expected = frame(), detector(frame()).detections
+    detector = make_random_detector("v4")
+    scan, expected = make_scan(), detector(make_scan()).detections
     higher_scan = replace(scan, xyz=scan.xyz - np.array([0, 0, 0.5], np.float32))
     detector.params = with_values(detector.params, {"ground.sensor_pose.height": 2.23})
     detections = detector(higher_scan).detections
-    assert same(replace(detections, boxes=detections.boxes + np.float32([0, 0, 0.5, 0, 0, 0, 0])), expected, 1e-3)
+    assert are_equal_detections(
+        replace(detections, boxes=detections.boxes + np.float32([0, 0, 0.5, 0, 0, 0, 0])), expected, 1e-3
+    )
 
 
 @pytest.mark.parametrize("roll, pitch", [(3.1416, 0.0), (0.0, 0.2), (0.1, -0.1)])
@@ -181,22 +191,22 @@ def test_tilted_sensor_gives_the_same_boxes_in_its_frame(roll, pitch):
     np.testing.assert_allclose(box[:3] @ rotation, [8, 2, -1], atol=1e-5)
     forward = np.array([np.cos(box[6]), np.sin(box[6]), 0]) @ rotation
     assert forward[:2] @ [np.cos(0.7), np.sin(0.7)] > 0.97  # yaw is about the sensor's own z
-    assert same(to_sensor_frame(detections, SensorPoseParams()), detections)
+    assert are_equal_detections(to_sensor_frame(detections, SensorPoseParams()), detections)
 
 
 def test_intensity_is_normalized_and_may_be_left_out():
-    detector, scan = random_detector(), frame()
+    detector, scan = make_random_detector(), make_scan()
     expected = detector(scan)
-    assert same(detector(replace(scan, intensity=scan.intensity / 2)), expected)
+    assert are_equal_detections(detector(replace(scan, intensity=scan.intensity / 2)), expected)
     reversed_scan = replace(scan, intensity=scan.intensity[::-1].copy())
-    assert not same(detector(reversed_scan), expected)
+    assert not are_equal_detections(detector(reversed_scan), expected)
     without_intensity = detector(replace(scan, intensity=None))
     assert "no intensity" in without_intensity.problem
     nan_intensity = np.where(np.arange(len(scan)) % 2, np.float32(np.nan), scan.intensity)
     assert "their intensity is NaN" in detector(replace(scan, intensity=nan_intensity)).problem
     detector.params = with_values(detector.params, {"pointpillars.use_intensity": False})
     for cloud in scan, replace(scan, intensity=None), replace(scan, intensity=nan_intensity):
-        assert same(detector(cloud), without_intensity) and detector(cloud).problem is None
+        assert are_equal_detections(detector(cloud), without_intensity) and detector(cloud).problem is None
 
 
 @pytest.mark.parametrize(
@@ -209,20 +219,20 @@ def test_intensity_is_normalized_and_may_be_left_out():
 )
 @pytest.mark.parametrize("version", ["v0", "v4"])
 def test_empty_cloud_is_reported_as_a_problem(version, xyz, message):
-    detector = random_detector(version)
+    detector = make_random_detector(version)
     result = detector(PointCloud(np.asarray(xyz, np.float32)))
     assert len(result.detections) == 0 and message in result.problem and result.timings["network"] == 0
-    assert detector(frame()).problem is None
+    assert detector(make_scan()).problem is None
 
 
 def test_cloud_of_ground_only_is_reported_as_a_problem():
-    detector, scan = random_detector("v4"), frame()
+    detector, scan = make_random_detector("v4"), make_scan()
     result = detector(scan, ground=np.ones(len(scan), bool))
     assert len(result.detections) == 0 and "ground.sensor_pose" in result.problem
 
 
 def test_best_scores_are_reported_if_nothing_is_detected():
-    detector, scan = random_detector("v4", eager(score=0.0)), frame()
+    detector, scan = make_random_detector("v4", lower_thresholds(score=0.0)), make_scan()
     assert detector(scan).best == {}
     detections = detector(scan).detections
     best_scores = {
@@ -235,14 +245,14 @@ def test_best_scores_are_reported_if_nothing_is_detected():
     assert list(result.best) == list(detector.classes)
     assert max(result.best.values()) == pytest.approx(max(best_scores.values()))
     assert all(result.best[name] >= score - 1e-6 for name, score in best_scores.items())
-    assert same(detector(scan), detections)  # the copy does not change the original
+    assert are_equal_detections(detector(scan), detections)  # the copy does not change the original
     for parameter in detector.proposer.network.network.head.parameters():
         parameter.fill_(np.nan)
     assert "NaN" in detector(scan).problem
 
 
 def test_huge_and_non_finite_clouds_are_handled():
-    detector, scan = random_detector("v2"), frame()
+    detector, scan = make_random_detector("v2"), make_scan()
     xyz = np.tile(scan.xyz, (250, 1))
     xyz[:5] = [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0], [1e9, 0, 0], [-np.inf, 0, np.nan]]
     assert len(xyz) > 900_000
@@ -256,9 +266,9 @@ def test_huge_and_non_finite_clouds_are_handled():
 
 def test_columns_of_wrong_length_are_rejected():
     with pytest.raises(InputError, match="ground has 3 values"):
-        random_detector()(frame(), ground=np.zeros(3, bool))
+        make_random_detector()(make_scan(), ground=np.zeros(3, bool))
     with pytest.raises(TypeError):  # columns are keyword-only, so that they cannot be confused
-        random_detector()(frame(), np.zeros(len(frame()), bool))
+        make_random_detector()(make_scan(), np.zeros(len(make_scan()), bool))
 
 
 class OutOfMemory(TorchNetwork):
@@ -278,19 +288,19 @@ class OutOfMemory(TorchNetwork):
 
 
 def test_cpu_fallback_after_out_of_memory_is_reported():
-    config, scan, meta = tiny(), frame(), "meta"
-    detector = make_detector(OutOfMemory(lively(config)), Header(config), eager(), meta)
+    config, scan, meta = make_tiny_config(), make_scan(), "meta"
+    detector = make_detector(OutOfMemory(make_random_network(config)), Header(config), lower_thresholds(), meta)
     for _ in range(2):
         result = detector(scan)
-        assert same(result, random_detector()(scan)) and "CPU" in result.problem
+        assert are_equal_detections(result, make_random_detector()(scan)) and "CPU" in result.problem
         assert detector.device == CPU
-    detector = make_detector(OutOfMemory(lively(config)), Header(config), eager(), meta)
+    detector = make_detector(OutOfMemory(make_random_network(config)), Header(config), lower_thresholds(), meta)
     copies = detector.with_min_score(0.5), detector.with_raw_scores()  # these share the network
     detector(scan)
     assert all(copied_detector.device == CPU and "CPU" in copied_detector(scan).problem for copied_detector in copies)
-    params = with_values(eager(), {"pointpillars.cpu_fallback": False})
+    params = with_values(lower_thresholds(), {"pointpillars.cpu_fallback": False})
     with pytest.raises(InputError, match="out of memory"):
-        make_detector(OutOfMemory(lively(config)), Header(config), params, meta)(scan)
+        make_detector(OutOfMemory(make_random_network(config)), Header(config), params, meta)(scan)
 
 
 @pytest.mark.parametrize(
@@ -309,5 +319,5 @@ def test_every_version_detects_cars_in_real_scans(data):
     scan = open_recording(data / "kitti_object").frames[0].load()
     for version in VERSIONS:
         config = make_config(version, "compact")
-        result = make_detector(TorchNetwork(lively(config)), Header(config))(scan)
+        result = make_detector(TorchNetwork(make_random_network(config)), Header(config))(scan)
         assert result.problem is None and result.timings["network"] > 0

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from detection_samples import frame, random_detector, same
+from detection_samples import are_equal_detections, make_random_detector, make_scan
 from hypothesis import given
 from hypothesis import strategies as st
-from pointnet_samples import random_detector as random_classifier
+from pointnet_samples import make_random_detector as random_classifier
 
 from lidar_perception.classes import CAR
 from lidar_perception.detectors.boxes import (
@@ -223,15 +223,15 @@ def detector():
     eager = with_values(
         FusedDetectorParams(), {f"fused.scores.{name}": 0.0 for name in ("car", "pedestrian", "cyclist", "other")}
     )
-    return FusedDetector(random_detector("v4").proposer, random_classifier().classifier, eager)
+    return FusedDetector(make_random_detector("v4").proposer, random_classifier().classifier, eager)
 
 
 def test_fused_detector_meets_the_contract(detector):
-    scan = frame()
+    scan = make_scan()
     result = detector(scan)
     assert len(result.detections) > 3 and tuple(result.timings) == STEPS
     assert (np.diff(result.detections.scores) <= 0).all()
-    assert same(detector(scan), result)  # no state is left in the detector
+    assert are_equal_detections(detector(scan), result)  # no state is left in the detector
     sources = result.detections.sources
     assert set(sources) == set(KNOTS) and all(len(x) == len(result.detections) for x in sources.values())
     is_car = result.detections.class_ids == CAR
@@ -239,8 +239,8 @@ def test_fused_detector_meets_the_contract(detector):
     median_score = float(np.median(result.detections.scores))
     strict_detector = detector.with_min_score(median_score)
     assert set(strict_detector.min_scores.values()) == {median_score}
-    assert same(strict_detector(scan), result.detections[result.detections.scores >= median_score])
-    assert same(detector(scan), result)
+    assert are_equal_detections(strict_detector(scan), result.detections[result.detections.scores >= median_score])
+    assert are_equal_detections(detector(scan), result)
     nothing = detector.with_min_score(1.0)(scan)
     assert len(nothing.detections) == 0 and set(nothing.best) == set(detector.classes)
     empty = detector(PointCloud(np.zeros((0, 3), np.float32), np.zeros(0, np.float32)))
@@ -250,7 +250,7 @@ def test_fused_detector_meets_the_contract(detector):
 
 
 def test_sensor_height_and_given_columns_keep_the_result(detector):
-    scan = frame()
+    scan = make_scan()
     detections = detector(scan).detections
     higher_scan = replace(scan, xyz=scan.xyz - np.array([0, 0, 0.5], np.float32))
     higher_detections = detector.with_sensor_height(1.73 + 0.5)(higher_scan).detections
@@ -270,8 +270,10 @@ def test_sensor_height_and_given_columns_keep_the_result(detector):
     view = NormalizedView.of(scan, low=config.low, high=config.high)
     ground = np.zeros(len(scan), bool)
     ground[view.indices] = segment_view_ground(view.frame, detector.params.ground)
-    assert same(detector(scan, ground=ground), detections)
-    assert same(detector(scan, ground=ground | ~np.isin(np.arange(len(scan)), view.indices)), detections)
+    assert are_equal_detections(detector(scan, ground=ground), detections)
+    assert are_equal_detections(
+        detector(scan, ground=ground | ~np.isin(np.arange(len(scan)), view.indices)), detections
+    )
 
 
 @pytest.mark.parametrize("use_intensity", [True, False])
@@ -281,18 +283,18 @@ def test_ground_computed_by_a_node_gives_equal_detections(detector, height, use_
     detector_copy = detector.with_params(
         with_values(detector.params, {"fused.use_intensity": use_intensity})
     ).with_sensor_height(height)
-    scan, config = frame(), detector_copy.proposer.config
+    scan, config = make_scan(), detector_copy.proposer.config
     scan = replace(scan, xyz=scan.xyz - np.array([0, 0, height - 1.73], np.float32))
     view = NormalizedView.of(scan, detector_copy.params.ground.sensor_pose, config.low, config.high)
     ground = np.zeros(len(scan), bool)
     ground[view.indices] = segment_view_ground(view.frame, detector_copy.params.ground)
     result = detector_copy(scan)
-    assert len(result.detections) > 3 and same(detector_copy(scan, ground=ground), result)
+    assert len(result.detections) > 3 and are_equal_detections(detector_copy(scan, ground=ground), result)
 
 
 def test_ignored_intensity_equals_missing_intensity(detector):
     """This includes the ground segmentation, which removes low dark points as reflections."""
-    scan, blind_detector = frame(), copy.copy(detector)
+    scan, blind_detector = make_scan(), copy.copy(detector)
     blind_detector.params = with_values(detector.params, {"fused.use_intensity": False})
     pit_points = np.random.default_rng(0).uniform([4, -4, -2.81], [9, 4, -2.79], (3000, 3))
     scan = PointCloud(
@@ -304,7 +306,10 @@ def test_ignored_intensity_equals_missing_intensity(detector):
         "no intensity" in detector(scan_without_intensity).problem
         and blind_detector(scan_without_intensity).problem is None
     )
-    assert same(blind_detector(scan), blind_detector(scan_without_intensity)) and blind_detector(scan).problem is None
+    assert (
+        are_equal_detections(blind_detector(scan), blind_detector(scan_without_intensity))
+        and blind_detector(scan).problem is None
+    )
     surfaces = [each.propose(scan).surface.heights for each in (blind_detector, detector)]
     np.testing.assert_array_equal(*surfaces)
 
@@ -313,12 +318,12 @@ def test_max_proposals_keeps_the_best_boxes(detector):
     unlimited, limited = copy.copy(detector), copy.copy(detector)
     params = with_values(detector.params, {"fused.classifier_box": 0.0})
     unlimited.params, limited.params = params, with_values(params, {"fused.max_proposals": 9})
-    all_proposals = unlimited.propose(frame()).detections
-    best_proposals = limited.propose(frame()).detections  # without the ego vehicle
+    all_proposals = unlimited.propose(make_scan()).detections
+    best_proposals = limited.propose(make_scan()).detections  # without the ego vehicle
     assert (
         len(all_proposals) > 100
         and 0 < len(best_proposals) <= 9
-        and same(best_proposals, all_proposals[: len(best_proposals)])
+        and are_equal_detections(best_proposals, all_proposals[: len(best_proposals)])
     )
 
 
@@ -326,7 +331,7 @@ def test_classifier_box_weight_interpolates_between_networks(detector):
     def propose(weight: float) -> tuple[np.ndarray, np.ndarray]:
         detector_copy = copy.copy(detector)
         detector_copy.params = with_values(detector.params, {"fused.classifier_box": weight})
-        proposals = detector_copy.propose(frame())
+        proposals = detector_copy.propose(make_scan())
         return proposals.detections.boxes, np.isfinite(proposals.evidence["classifier"])
 
     (proposer_boxes, is_classified), (half_boxes, _), (classifier_boxes, _) = (
@@ -365,14 +370,14 @@ def test_nearby_car_that_is_not_ego_vehicle_is_kept(detector, monkeypatch, heigh
     """The ego vehicle is determined with the actual sensor height instead of 1.73 m."""
     car = Detections.of([[0, 1.4, -0.98, 4, 1.6, 1.5, 0]], CAR, 0.9)  # 0.6 m aside
     monkeypatch.setattr(detector.proposer.__class__, "propose", lambda *_: DetectionResult(car))
-    assert len(detector.with_sensor_height(height).propose(frame()).detections) == stays
+    assert len(detector.with_sensor_height(height).propose(make_scan()).detections) == stays
 
 
 def test_cpu_fallback_of_one_network_is_reported(detector):
     fallback_detector = copy.copy(detector)
     fallback_detector.classifier = copy.copy(detector.classifier)
     fallback_detector.classifier.placement = Placement(CPU, "cuda is out of memory")
-    assert fallback_detector(frame()).problem == "cuda is out of memory" and detector(frame()).problem is None
+    assert fallback_detector(make_scan()).problem == "cuda is out of memory" and detector(make_scan()).problem is None
 
 
 def test_without_cpu_fallback_the_error_is_raised(detector, monkeypatch):
@@ -387,14 +392,14 @@ def test_without_cpu_fallback_the_error_is_raised(detector, monkeypatch):
     broken_detector.classifier.placement = Placement("meta")
     broken_detector.params = with_values(detector.params, {"fused.cpu_fallback": False})
     with pytest.raises(InputError, match="meta is out of memory"):
-        broken_detector(frame())
+        broken_detector(make_scan())
 
 
 def test_parameters_can_change_between_clouds(detector):
     strict_detector = copy.copy(detector)
     strict_detector.params = with_values(detector.params, {"fused.proposals": 0.6})
-    assert len(strict_detector(frame()).detections) < len(detector(frame()).detections)
-    assert same(detector(frame()), detector(frame()))
+    assert len(strict_detector(make_scan()).detections) < len(detector(make_scan()).detections)
+    assert are_equal_detections(detector(make_scan()), detector(make_scan()))
 
 
 def test_clouds_without_usable_intensity_use_separate_curves():
@@ -402,13 +407,17 @@ def test_clouds_without_usable_intensity_use_separate_curves():
     other_curves = copy.copy(detector)
     other_curves.models = detector.models_without_intensity
     assert other_curves.models != detector.models
-    scan = frame()
+    scan = make_scan()
     scan_without_intensity = replace(scan, intensity=None)
     detectors = detector.with_min_score(0.0), other_curves.with_min_score(0.0)
-    assert same(*(one(scan_without_intensity) for one in detectors)) and not same(*(one(scan) for one in detectors))
-    assert same(detector(replace(scan, intensity=np.full_like(scan.intensity, 0.3))), detector(scan_without_intensity))
+    assert are_equal_detections(*(one(scan_without_intensity) for one in detectors)) and not are_equal_detections(
+        *(one(scan) for one in detectors)
+    )
+    assert are_equal_detections(
+        detector(replace(scan, intensity=np.full_like(scan.intensity, 0.3))), detector(scan_without_intensity)
+    )
     detector_without_intensity = detector.with_params(with_values(detector.params, {"fused.use_intensity": False}))
-    assert same(detector_without_intensity(scan), detector(scan_without_intensity))
+    assert are_equal_detections(detector_without_intensity(scan), detector(scan_without_intensity))
     eager_detector = detector.with_min_score(0.01)
     assert len(eager_detector(scan_without_intensity).detections) >= len(detector(scan_without_intensity).detections)
     single_model_detector = FusedDetector(detector.proposer, detector.classifier, detector.params, detector.models)

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 import torch
-from pointnet_samples import blobs
+from pointnet_samples import make_blobs
 
 from lidar_perception.detectors.config_json import parse_config
 from lidar_perception.detectors.pointnet import config as config_module
@@ -90,7 +90,7 @@ def test_make_clusters_groups_points_by_id(rng):
 
 
 def test_sampled_points_are_unique_and_independent_of_others(rng):
-    clusters = blobs(rng, [1, 7, 24, 90, 400])
+    clusters = make_blobs(rng, [1, 7, 24, 90, 400])
     inputs = make_network_input(clusters, 24)
     assert inputs.valid.sum(axis=1).tolist() == [1, 7, 24, 24, 24]
     for i in range(len(clusters)):
@@ -107,7 +107,7 @@ def test_sampled_points_are_unique_and_independent_of_others(rng):
 
 @pytest.mark.parametrize("size", [1, 3, 20, 60])
 def test_farthest_points_come_first(rng, size):
-    clusters = blobs(rng, [size, 7])
+    clusters = make_blobs(rng, [size, 7])
     random_inputs = make_network_input(clusters, 24)
     inputs = make_network_input(clusters, 24, farthest_count=10)
     np.testing.assert_array_equal(inputs.valid, random_inputs.valid)
@@ -135,7 +135,7 @@ def test_ground_height_follows_slopes(rng):
     assert len(find_ground_heights(ground, np.zeros((0, 2)))) == 0
     assert (find_ground_heights(ground[:0], positions) == -SENSOR_HEIGHT).all()
     # heights are relative to the ground, so a hill changes nothing
-    clusters = replace(blobs(rng, [20, 30]), ground=np.array([-1.7, -1.5]))
+    clusters = replace(make_blobs(rng, [20, 30]), ground=np.array([-1.7, -1.5]))
     lifted = replace(clusters, points=clusters.points + np.float32([0, 0, 3, 0]), ground=clusters.ground + 3)
     inputs, lifted_inputs = make_network_input(clusters, 24), make_network_input(lifted, 24)
     assert np.allclose(inputs.context, lifted_inputs.context, atol=1e-5)
@@ -144,7 +144,7 @@ def test_ground_height_follows_slopes(rng):
 
 
 def test_network_input_does_not_depend_on_azimuth(rng):
-    clusters, angle = blobs(rng, [30, 40]), 2.0
+    clusters, angle = make_blobs(rng, [30, 40]), 2.0
     rotated_points = clusters.points.copy()
     cos, sin = np.cos(angle), np.sin(angle)
     rotated_points[:, 0] = cos * clusters.points[:, 0] - sin * clusters.points[:, 1]
@@ -182,7 +182,7 @@ def test_nearest_neighbours_equal_brute_force(rng):
 @pytest.mark.parametrize("name", ["improved", "ball-density"])
 def test_groups_equal_plain_loops(rng, name):
     net = make_network(name)
-    inputs = make_network_input(blobs(rng, [60, 5]), net.config.points)
+    inputs = make_network_input(make_blobs(rng, [60, 5]), net.config.points)
     points, valid = torch.from_numpy(inputs.points), torch.from_numpy(inputs.valid)
     with torch.inference_mode():
         features = net.points(points)
@@ -213,7 +213,7 @@ def test_groups_equal_plain_loops(rng, name):
 @pytest.mark.parametrize("name", NETWORKS)
 def test_padding_points_do_not_change_the_output(rng, name):
     net = make_network(name)
-    clusters = blobs(rng, [10, 12, 2, 24, 6, 7, 40])
+    clusters = make_blobs(rng, [10, 12, 2, 24, 6, 7, 40])
     inputs = make_network_input(clusters, net.config.points)
     changed_points = inputs.points.copy()
     for i in range(len(clusters)):
@@ -231,7 +231,7 @@ def test_padding_points_do_not_change_the_output(rng, name):
 
 
 def test_batch_norms_are_folded_into_the_layers_before_them(rng):
-    clusters = blobs(rng, [40, 9, 3])
+    clusters = make_blobs(rng, [40, 9, 3])
     expected = compute_outputs(make_network(), clusters)
     for output, folded_output in zip(expected, compute_outputs(fuse_norms(make_network()), clusters)):
         assert torch.allclose(output, folded_output, atol=1e-4)
@@ -285,7 +285,7 @@ def make_outputs(targets: BoxTargets, bins: int) -> Outputs:
 
 def test_decoding_undoes_encoding(rng):
     config, count = make_pointnet_config(), 200
-    clusters = blobs(rng, [5] * count)
+    clusters = make_blobs(rng, [5] * count)
     inputs = make_network_input(clusters, 8)
     labels = rng.integers(0, 3, count)
     sizes = np.array(config.sizes)[labels] * np.exp(rng.uniform(-1.5, 1.5, (count, 3)))
@@ -300,7 +300,7 @@ def test_decoding_undoes_encoding(rng):
 
 def test_loss_is_lowest_at_targets_and_ignores_background(rng):
     config = make_pointnet_config()
-    inputs = make_network_input(blobs(rng, [5] * 6), 8)
+    inputs = make_network_input(make_blobs(rng, [5] * 6), 8)
     boxes = np.column_stack([inputs.centres, np.full((6, 3), 1.5), np.linspace(-3, 3, 6)])
     targets = encode(boxes, np.zeros(6, int), inputs.centres, inputs.azimuths, config)
     labels = torch.tensor([0, 0, 0, 0, 3, -1])
@@ -344,7 +344,7 @@ def test_calibration_makes_scores_match_accuracy(rng):
 
 def test_best_of_overlapping_boxes_is_kept(rng):
     config = make_pointnet_config()
-    predictions = predict(TorchPointNet(make_network()), blobs(rng, [20] * 4))
+    predictions = predict(TorchPointNet(make_network()), make_blobs(rng, [20] * 4))
     boxes = np.tile(np.array([5, 5, 0, 4, 2, 1.5, 0.3], np.float32), (4, 1))
     boxes[3, 0] += 20
     probabilities = np.array([[0.6, 0, 0, 0.4], [0.9, 0, 0, 0.1], [0.1, 0, 0, 0.9], [0.5, 0, 0, 0.5]], np.float32)

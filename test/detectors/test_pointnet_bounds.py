@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pointnet_samples import eager, random_detector
+from pointnet_samples import accept_every_cluster, make_random_detector
 
 from lidar_perception.detectors.pointnet.clusters import find_ground_heights
 from lidar_perception.detectors.pointnet.torch_network import CHUNK
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def test_clusters_of_any_size_and_number_are_accepted():
     rng = np.random.default_rng(0)
-    detector = random_detector(with_values(eager(), {"pointnet.min_points": 1}))
+    detector = make_random_detector(with_values(accept_every_cluster(), {"pointnet.min_points": 1}))
     network, batches = detector.classifier.network, []
     network.compiled = None
     network.network.register_forward_hook(lambda net, arguments, _: batches.append(len(arguments[0])))
@@ -44,17 +44,17 @@ def test_most_distant_excess_clusters_are_dropped_and_counted():
 
     def detect(params, mask=None):
         cluster_ids = ids if mask is None else np.where(mask, ids, 0)
-        return random_detector(with_values(params, {"pointnet.use_intensity": False}))(
+        return make_random_detector(with_values(params, {"pointnet.use_intensity": False}))(
             frame, ground=ground, cluster_ids=cluster_ids
         )
 
-    limited_params = with_values(eager(), {"pointnet.max_clusters": 40})
-    limited_result, full_result = detect(limited_params), detect(eager())
+    limited_params = with_values(accept_every_cluster(), {"pointnet.max_clusters": 40})
+    limited_result, full_result = detect(limited_params), detect(accept_every_cluster())
     assert "farthest 260 of 300 clusters are ignored" in limited_result.problem
     assert "left out" not in (full_result.problem or "")
     means = np.add.reduceat(xyz, np.arange(0, 1800, 6)) / 6
     nearest = np.argsort(np.hypot(means[:, 0], means[:, 1]))[:40] + 1
-    expected = detect(eager(), np.isin(ids, nearest))
+    expected = detect(accept_every_cluster(), np.isin(ids, nearest))
     np.testing.assert_array_equal(limited_result.detections.boxes, expected.detections.boxes)
     assert 0 < len(limited_result.detections) < len(full_result.detections)
 

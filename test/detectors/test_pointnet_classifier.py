@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from candidate_samples import boxes_at, scene
-from pointnet_samples import random_detector
+from candidate_samples import make_boxes_at, make_people_scene
+from pointnet_samples import make_random_detector
 
 from lidar_perception.detectors.pointnet.classifier import BOX_MARGIN_M
 from lidar_perception.detectors.pointnet.clusters import crop_boxes
@@ -22,14 +22,14 @@ CAR, VAN = CLASSES.index("Car"), CLASSES.index("Van")
 
 @pytest.fixture(scope="module")
 def frame():
-    xyz = scene()
+    xyz = make_people_scene()
     return PointCloud(xyz, np.random.default_rng(1).uniform(0, 1, len(xyz)).astype(np.float32))
 
 
 @pytest.fixture
 def proposals():
     """Return boxes around two people and a post, and one without points."""
-    boxes = boxes_at([(7, 2), (12, -5), (10.95, 9.5), (30, 30)])
+    boxes = make_boxes_at([(7, 2), (12, -5), (10.95, 9.5), (30, 30)])
     boxes[2, 3:6] = 2.5, 3.5, 1.6
     return Detections.of(boxes, [PEDESTRIAN, CAR, CAR, PEDESTRIAN], [0.9, 0.8, 0.5, 0.4])
 
@@ -49,7 +49,7 @@ def test_points_in_each_box_form_a_cluster(frame, proposals):
 
 
 def test_proposals_are_classified_independently(frame, proposals):
-    classifier, ground = random_detector().classifier, np.zeros((0, 3), np.float32)
+    classifier, ground = make_random_detector().classifier, np.zeros((0, 3), np.float32)
     mask = np.ones(len(proposals), bool)
     probabilities, boxes = classifier.classify(proposals, frame, ground, mask)
     predictions = predict(classifier.network, crop_boxes(proposals.boxes[:3], frame, BOX_MARGIN_M))
@@ -64,6 +64,6 @@ def test_proposals_are_classified_independently(frame, proposals):
 def test_classifier_skips_unknown_classes_and_empty_boxes(frame, proposals):
     proposals.class_ids[1] = VAN
     mask = np.array([True, True, False, True])
-    for values in random_detector().classifier.classify(proposals, frame, frame.xyz[:0], mask):
+    for values in make_random_detector().classifier.classify(proposals, frame, frame.xyz[:0], mask):
         is_classified = np.isfinite(values.reshape(4, -1)).all(axis=1)
         assert is_classified.tolist() == [True, False, False, False]

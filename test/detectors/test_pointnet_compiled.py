@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from pointnet_samples import blobs, lively, random_detector, small
+from pointnet_samples import make_blobs, make_random_detector, make_random_network, make_small_config
 
 from lidar_perception.detectors.layer_weights import to_arrays
 from lidar_perception.detectors.matrix_kernel import LANES
@@ -33,7 +33,7 @@ def compile_network(network):
 
 
 def assert_equal(config, clusters, seed=0):
-    network = lively(config, seed)
+    network = make_random_network(config, seed)
     inputs = make_network_input(clusters, config.points, farthest_count=config.farthest_count)
     with torch.inference_mode():
         outputs, expected_outputs = compile_network(network)(inputs), run_network(network, inputs)
@@ -47,7 +47,7 @@ def assert_equal(config, clusters, seed=0):
 @pytest.mark.parametrize("name", NETWORKS)
 def test_compiled_networks_equal_torch(name, spread):
     rng = np.random.default_rng(0)
-    assert_equal(small(name), blobs(rng, SIZES, spread))
+    assert_equal(make_small_config(name), make_blobs(rng, SIZES, spread))
 
 
 @pytest.mark.parametrize(
@@ -70,12 +70,12 @@ def test_compiled_networks_equal_torch(name, spread):
 )
 def test_networks_of_other_widths_equal_torch(changes):
     rng = np.random.default_rng(1)
-    assert_equal(make_pointnet_config(**changes), blobs(rng, SIZES))
+    assert_equal(make_pointnet_config(**changes), make_blobs(rng, SIZES))
 
 
 def test_batching_does_not_change_results(monkeypatch):
-    network = compile_network(lively(small()))
-    clusters = blobs(np.random.default_rng(2), SIZES * 3)
+    network = compile_network(make_random_network(make_small_config()))
+    clusters = make_blobs(np.random.default_rng(2), SIZES * 3)
     predictions = predict(network, clusters)
     indices = np.array([4, 0, 30, 17])
     subset_predictions = predict(network, clusters.take(indices))
@@ -94,9 +94,9 @@ def test_batching_does_not_change_results(monkeypatch):
     "name", ["points.0.0.weight", "local.nets.1.0.0.weight", "coarse.net.0.0.weight", "fine.0.0.bias"]
 )
 def test_nan_weights_give_nan_logits(name):
-    network = fuse_norms(lively(small()))
+    network = fuse_norms(make_random_network(make_small_config()))
     network.get_parameter(name).view(-1)[0] = torch.nan
-    inputs = make_network_input(blobs(np.random.default_rng(3), SIZES), 32)
+    inputs = make_network_input(make_blobs(np.random.default_rng(3), SIZES), 32)
     assert np.isnan(compile_network(network)(inputs).logits).all()
 
 
@@ -108,8 +108,8 @@ def test_torch_engine_compiles_nothing(weights):
 
 
 def test_compiled_classifier_equals_torch():
-    classifier = random_detector().classifier
-    clusters = blobs(np.random.default_rng(4), SIZES)
+    classifier = make_random_detector().classifier
+    clusters = make_blobs(np.random.default_rng(4), SIZES)
     predictions = classifier.predict(clusters)
     classifier.network.compiled = None
     expected = classifier.predict(clusters)

@@ -9,7 +9,13 @@ import sys
 import numpy as np
 import pytest
 import torch
-from detection_samples import lively, make_detector, random_detector, same, tiny
+from detection_samples import (
+    are_equal_detections,
+    make_detector,
+    make_random_detector,
+    make_random_network,
+    make_tiny_config,
+)
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
@@ -41,7 +47,7 @@ WIDE = dict(low=(-12.8, -14.08, -3.0), high=(12.8, 14.08, 1.0))  # 176 x 160 pil
 
 def make_strong_network(config, seed=0):
     """Return a network in which each point affects the outputs of the last layer."""
-    network = lively(config, seed)
+    network = make_random_network(config, seed)
     for module in network.modules():
         if isinstance(module, torch.nn.Conv2d) and module.kernel_size == (3, 3):
             module.weight.mul_(2.0)
@@ -70,7 +76,7 @@ def make_inputs(config, points, map_fraction, seed=0, range_fraction=1.0):
     return (make_pillars(cloud.astype(np.float32), config), maps if config.pseudo_map else None)
 
 
-def by_torch(network, torch_pillars, maps):
+def run_torch(network, torch_pillars, maps):
     """Return features and logits (H * W, C) of all cells."""
     torch_pillars = Pillars(*map(torch.from_numpy, torch_pillars[:3]), *torch_pillars[3:])
     features = network.compute_features(torch_pillars, None if maps is None else torch.from_numpy(maps))
@@ -81,7 +87,7 @@ def assert_equal(config, points, map_fraction, reach=None, seed=0, range_fractio
     network = make_strong_network(config, seed)
     pillars, maps = make_inputs(config, points, map_fraction, seed, range_fraction)
     with torch.inference_mode():
-        expected = by_torch(network, pillars, maps)
+        expected = run_torch(network, pillars, maps)
     cells, features, logits = make_sparse_network(network).evaluate(pillars, maps, reach)
     assert len(cells) == len(expected[0]) or reach is not None
     values = features.get_features(cells)[:, : expected[0].shape[1]]
@@ -93,7 +99,7 @@ def assert_equal(config, points, map_fraction, reach=None, seed=0, range_fractio
 @pytest.mark.parametrize("version", ["v1", "v2", "v4"])
 @pytest.mark.parametrize(("points", "map_fraction"), [(0, 0.0), (1, 0.0), (5, 0.01), (20_000, 1.0)])
 def test_small_network_equals_torch(version, points, map_fraction):
-    assert_equal(tiny(version), points, map_fraction, seed=points)
+    assert_equal(make_tiny_config(version), points, map_fraction, seed=points)
 
 
 @pytest.mark.parametrize(
@@ -153,7 +159,7 @@ def test_head_is_evaluated_only_near_points():
 
 
 def test_boxes_equal_torch_at_any_anchors():
-    config = tiny("v4")
+    config = make_tiny_config("v4")
     network, (pillars, maps) = make_strong_network(config), make_inputs(config, 30, 0.02)
     expected, actual = TorchNetwork(network)(pillars, maps), make_sparse_network(network)(pillars, maps)
     rows = np.array([0, 5, 17, len(actual.anchors) - 1])
@@ -190,8 +196,8 @@ def test_error_in_a_worker_thread_is_raised(monkeypatch):
 
 @pytest.mark.parametrize("layer", ["pillar_net.linear.weight", "blocks.1.0.0.weight", "neck.laterals.2.weight"])
 def test_nan_weights_are_reported(layer):
-    config = tiny("v4")
-    network = lively(config)
+    config = make_tiny_config("v4")
+    network = make_random_network(config)
     network.get_parameter(layer).fill_(torch.nan)
     detector = make_detector(make_sparse_network(network), Header(config))
     rng = np.random.default_rng(0)
@@ -203,18 +209,18 @@ def test_nan_weights_are_reported(layer):
 @pytest.mark.parametrize(
     "config, settings, message",
     [
-        (tiny("v0"), {}, "ground"),
-        (tiny("v3"), {}, "ground"),
-        (tiny("v1", fusion="concat"), {}, "neck"),
-        (tiny("v1", neck="deconv"), {}, "neck"),
-        (tiny("v1", max_points=4, zero_row=True), {}, "padded with zeros"),
-        (tiny("v4"), {"pointpillars.amp": "bf16"}, "16 bits"),
-        (tiny("v4"), {}, "AVX2"),
+        (make_tiny_config("v0"), {}, "ground"),
+        (make_tiny_config("v3"), {}, "ground"),
+        (make_tiny_config("v1", fusion="concat"), {}, "neck"),
+        (make_tiny_config("v1", neck="deconv"), {}, "neck"),
+        (make_tiny_config("v1", max_points=4, zero_row=True), {}, "padded with zeros"),
+        (make_tiny_config("v4"), {"pointpillars.amp": "bf16"}, "16 bits"),
+        (make_tiny_config("v4"), {}, "AVX2"),
     ],
 )
 def test_unsupported_networks_run_in_torch(config, settings, message, tmp_path, monkeypatch):
     path = tmp_path / "a.safetensors"
-    save_checkpoint(path, lively(config), Header(config))
+    save_checkpoint(path, make_random_network(config), Header(config))
     if message == "AVX2":
         monkeypatch.setattr(sparse, "LANES", 0)
     settings = {**settings, "pointpillars.warm_up": False}
@@ -270,22 +276,22 @@ def test_detections_of_kitti_frames_equal_torch(data, both_engines):
 
 @pytest.mark.parametrize("version", ["v1", "v2", "v4"])
 def test_detector_of_random_weights_equals_torch(version):
-    detector = random_detector(version)
+    detector = make_random_detector(version)
     detector.params = with_values(detector.params, {"pointpillars.nms.candidates": 5000})
     header = detector.proposer.header
-    sparse_detector = make_detector(make_sparse_network(lively(header.config)), header, detector.params)
+    sparse_detector = make_detector(make_sparse_network(make_random_network(header.config)), header, detector.params)
     rng = np.random.default_rng(3)
     cloud = rng.uniform([0, -5, -1.5, 0], [10, 5, 0.5, 1], (4000, 4)).astype(np.float32)
     columns = dict(ground=np.zeros(4000, bool), cluster_ids=rng.integers(0, 9, 4000))
     result = detector(cloud, **columns)
     assert len(result.detections) > 3
-    assert same(sparse_detector(cloud, **columns), result, atol=TOLERANCE)
+    assert are_equal_detections(sparse_detector(cloud, **columns), result, atol=TOLERANCE)
 
 
 def test_cloud_without_pillars_has_no_detections():
-    detector = random_detector("v4")
+    detector = make_random_detector("v4")
     proposer, config = detector.proposer, detector.proposer.config
-    proposer.network = make_sparse_network(lively(config))
+    proposer.network = make_sparse_network(make_random_network(config))
     nan_input = NetworkInput(np.full((10, 4), np.nan, np.float32), np.zeros((3, *config.grid), np.uint8))
     _, predictions = proposer._predict({False: nan_input})
     result = proposer._decode(predictions, [0.5] * 3, NmsParams())

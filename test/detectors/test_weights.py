@@ -15,7 +15,15 @@ import pointnet_samples
 import pytest
 import torch
 from click.testing import CliRunner
-from detection_samples import eager, frame, lively, make_detector, random_detector, same, tiny
+from detection_samples import (
+    are_equal_detections,
+    lower_thresholds,
+    make_detector,
+    make_random_detector,
+    make_random_network,
+    make_scan,
+    make_tiny_config,
+)
 
 from lidar_perception.cli.main import cli
 from lidar_perception.detectors import weights_file
@@ -42,16 +50,16 @@ needs_onnx = pytest.mark.skipif(
 
 
 @pytest.fixture
-def saved(tmp_path):
-    config = tiny("v4")
+def checkpoint(tmp_path):
+    config = make_tiny_config("v4")
     header = Header(config, {"data": "simulated", "steps": 10}, {"map": 0.5}, "abc123", {"Pedestrian": (1.5, -0.25)})
-    network = lively(config)
+    network = make_random_network(config)
     save_checkpoint(tmp_path / "w.safetensors", network, header)
     return tmp_path / "w.safetensors", header, network
 
 
-def test_checkpoint_survives_saving_and_loading(saved, tmp_path):
-    path, header, network = saved
+def test_checkpoint_survives_saving_and_loading(checkpoint, tmp_path):
+    path, header, network = checkpoint
     assert read_header(path) == header
     loaded_header, loaded = load_network(path, header.config)
     assert loaded_header == header
@@ -61,15 +69,15 @@ def test_checkpoint_survives_saving_and_loading(saved, tmp_path):
     assert (tmp_path / "half").stat().st_size < path.stat().st_size
     for name, value in load_network(tmp_path / "half")[1].state_dict().items():
         torch.testing.assert_close(value, network.state_dict()[name], atol=1e-7, rtol=0 if value.ndim < 2 else 2**-10)
-    result = load_detector(path, "cpu", eager(engine="torch"))(frame())
-    expected = make_detector(TorchNetwork(network), header, eager())(frame())
-    assert len(result.detections) and same(result, expected)
+    result = load_detector(path, "cpu", lower_thresholds(engine="torch"))(make_scan())
+    expected = make_detector(TorchNetwork(network), header, lower_thresholds())(make_scan())
+    assert len(result.detections) and are_equal_detections(result, expected)
 
 
-def test_error_for_another_config_shows_both_values(saved):
-    path, _, _ = saved
+def test_error_for_another_config_shows_both_values(checkpoint):
+    path, _, _ = checkpoint
     with pytest.raises(InputError, match=r"version is v4, expected v2"):
-        load_network(path, tiny("v2"))
+        load_network(path, make_tiny_config("v2"))
     params = with_values(DetectorParams(), {"pointpillars.version": "v1"})
     with pytest.raises(InputError, match=r"has version v4, not v1"):
         load_detector(path, "cpu", params)
@@ -77,15 +85,15 @@ def test_error_for_another_config_shows_both_values(saved):
         load_detector(path, "cpu", with_values(DetectorParams(), {"pointpillars.size": "full"}))
 
 
-def test_matching_weights_of_another_network_are_copied(saved):
-    path, header, network = saved
+def test_matching_weights_of_another_network_are_copied(checkpoint):
+    path, header, network = checkpoint
     state = network.state_dict()
     same_network = make_network(header.config)
     copied, count = copy_matching_weights(same_network, path, NetworkConfig)
     assert copied == count == len(state)
     assert all(torch.equal(value, state[name]) for name, value in same_network.state_dict().items())
     # without the map branch the first block has fewer inputs; it copies the matching ones
-    smaller_network = make_network(tiny("v1"))
+    smaller_network = make_network(make_tiny_config("v1"))
     copied, count = copy_matching_weights(smaller_network, path, NetworkConfig)
     assert copied == count
     new_weight, stored_weight = (s["blocks.0.0.0.weight"] for s in (smaller_network.state_dict(), state))
@@ -93,12 +101,12 @@ def test_matching_weights_of_another_network_are_copied(saved):
         new_weight, stored_weight[:, : new_weight.shape[1]]
     )
     # a new input, such as the cluster id, comes last and starts at 0
-    network_with_ids = make_network(tiny("v2"))
+    network_with_ids = make_network(make_tiny_config("v2"))
     assert len(set(copy_matching_weights(network_with_ids, path, NetworkConfig))) == 1
     new_weight, stored_weight = (s["pillar_net.linear.weight"] for s in (network_with_ids.state_dict(), state))
     assert torch.equal(new_weight[:, :-1], stored_weight) and not new_weight[:, -1].any()
     # a different neck starts with random weights
-    different_network = make_network(tiny("v0"))
+    different_network = make_network(make_tiny_config("v0"))
     initial_state = {name: value.clone() for name, value in different_network.state_dict().items()}
     copied, count = copy_matching_weights(different_network, path, NetworkConfig)
     assert 0 < copied < count
@@ -111,8 +119,8 @@ def test_matching_weights_of_another_network_are_copied(saved):
         copy_matching_weights(torch.nn.Linear(2, 3), path, NetworkConfig)
 
 
-def test_invalid_checkpoint_files_are_rejected(saved, tmp_path):
-    path, _, _ = saved
+def test_invalid_checkpoint_files_are_rejected(checkpoint, tmp_path):
+    path, _, _ = checkpoint
     content = path.read_bytes()
     length = struct.unpack("<Q", content[:8])[0]
     names = json.loads(content[8 : 8 + length])
@@ -143,8 +151,8 @@ def test_invalid_checkpoint_files_are_rejected(saved, tmp_path):
         assert "\n" not in str(error.value) and name in str(error.value)
 
 
-def test_last_checkpoint_survives_a_full_disk(saved, monkeypatch):
-    path, header, network = saved
+def test_last_checkpoint_survives_a_full_disk(checkpoint, monkeypatch):
+    path, header, network = checkpoint
     content = path.read_bytes()
 
     def raise_disk_full(*_):
@@ -163,23 +171,26 @@ def test_model_card_states_the_sensor_of_the_header():
         ({"name": "vlp-16", "beams": 16, "height": 0.6}, "Sensor: vlp-16, 16 beams, 0.6 m above the ground."),
         ({}, "Sensor: several, which the header does not list."),
     ):
-        assert expected in describe(Header(tiny(), training={**training, "sensor": sensor}), "v4")
+        assert expected in describe(Header(make_tiny_config(), training={**training, "sensor": sensor}), "v4")
 
 
 def test_error_for_missing_weights_explains_how_to_get_them(tmp_path, monkeypatch):
     monkeypatch.setattr(weights_file, "POINTPILLARS_WEIGHTS", tmp_path)
     with pytest.raises(InputError, match="no weights for v4 compact"):
         load_detector("", "cpu")
-    params = with_values(eager(engine="torch"), {"pointpillars.version": "v1"})
-    config = tiny("v1")
-    save_checkpoint(tmp_path / "pointpillars_v1_compact.safetensors", lively(config), Header(config))
-    assert same(load_detector("", "cpu", params)(frame()), random_detector("v1")(frame()))
+    params = with_values(lower_thresholds(engine="torch"), {"pointpillars.version": "v1"})
+    config = make_tiny_config("v1")
+    save_checkpoint(tmp_path / "pointpillars_v1_compact.safetensors", make_random_network(config), Header(config))
+    assert are_equal_detections(load_detector("", "cpu", params)(make_scan()), make_random_detector("v1")(make_scan()))
     named_params = with_values(
-        eager(engine="torch"), {"pointpillars.weights": str(tmp_path / "pointpillars_v1_compact.safetensors")}
+        lower_thresholds(engine="torch"),
+        {"pointpillars.weights": str(tmp_path / "pointpillars_v1_compact.safetensors")},
     )
-    assert same(load_detector("", "cpu", named_params)(frame()), random_detector("v1")(frame()))
+    assert are_equal_detections(
+        load_detector("", "cpu", named_params)(make_scan()), make_random_detector("v1")(make_scan())
+    )
     with pytest.raises(InputError, match="checkpoint not found: /nowhere"):
-        load_detector("", "cpu", with_values(eager(), {"pointpillars.weights": "/nowhere"}))
+        load_detector("", "cpu", with_values(lower_thresholds(), {"pointpillars.weights": "/nowhere"}))
 
 
 # export
@@ -191,31 +202,33 @@ def test_exported_network_gives_the_same_detections(tmp_path):
     """v0 is exported by the function, v4 by the command. The other versions consist of parts of both."""
     from lidar_perception.detectors.pointpillars.onnx import OnnxNetwork, export_onnx
 
-    config = tiny("v0", anchors=tiny().anchors[:1], max_points=3, zero_row=True, middle_z=True)
-    network, header = lively(config), Header(config, {"steps": 3})
+    config = make_tiny_config("v0", anchors=make_tiny_config().anchors[:1], max_points=3, zero_row=True, middle_z=True)
+    network, header = make_random_network(config), Header(config, {"steps": 3})
     export_onnx(network, header, tmp_path / "n.onnx")
-    exported = load_detector(tmp_path / "n.onnx", "auto", eager(score=0.1))
+    exported = load_detector(tmp_path / "n.onnx", "auto", lower_thresholds(score=0.1))
     assert exported.proposer.header == header
     assert isinstance(exported.proposer.network, OnnxNetwork)
-    expected = make_detector(TorchNetwork(network), header, eager(score=0.1))(frame())
-    assert len(expected.detections) and same(exported(frame()), expected, 1e-4)
+    expected = make_detector(TorchNetwork(network), header, lower_thresholds(score=0.1))(make_scan())
+    assert len(expected.detections) and are_equal_detections(exported(make_scan()), expected, 1e-4)
 
 
 @needs_onnx
-def test_export_reads_checkpoints_and_rejects_bad_files(saved, tmp_path, monkeypatch):
-    path, _, _ = saved
+def test_export_reads_checkpoints_and_rejects_bad_files(checkpoint, tmp_path, monkeypatch):
+    path, _, _ = checkpoint
     out = tmp_path / "o/w.onnx"
     result = CliRunner().invoke(cli, ["export", "onnx", str(path), "--out", str(out)])
     assert result.exit_code == 0 and "v4 compact" in " ".join(result.output.split())
-    assert same(
-        load_detector(out, "cpu", eager())(frame()), load_detector(path, "cpu", eager(engine="torch"))(frame()), 1e-4
+    assert are_equal_detections(
+        load_detector(out, "cpu", lower_thresholds())(make_scan()),
+        load_detector(path, "cpu", lower_thresholds(engine="torch"))(make_scan()),
+        1e-4,
     )
     with pytest.raises(InputError, match="not on 'cuda'"):
         load_detector(out, "cuda")
     with pytest.raises(InputError, match="set amp: off"):
-        load_detector(out, "cpu", with_values(eager(), {"pointpillars.amp": "bf16"}))
+        load_detector(out, "cpu", with_values(lower_thresholds(), {"pointpillars.amp": "bf16"}))
     with pytest.raises(InputError, match="set engine: auto"):
-        load_detector(out, "cpu", eager(engine="sparse"))
+        load_detector(out, "cpu", lower_thresholds(engine="sparse"))
     (tmp_path / "bad.onnx").write_bytes(out.read_bytes()[:-50])
     for name, message in ("bad.onnx", "cannot read"), ("none.onnx", "exported network not found"):
         with pytest.raises(InputError, match=message):
@@ -225,10 +238,10 @@ def test_export_reads_checkpoints_and_rejects_bad_files(saved, tmp_path, monkeyp
 @needs_onnx
 @pytest.mark.parametrize("name", ["improved", "farthest-ball-density", "pointnet"])
 def test_exported_pointnet_gives_the_same_detections(tmp_path, name):
-    config = pointnet_samples.small(name)
+    config = pointnet_samples.make_small_config(name)
     network, clusters = (
-        pointnet_samples.lively(config),
-        pointnet_samples.blobs(np.random.default_rng(0), [1, 5, 30, 100, 7]),
+        pointnet_samples.make_random_network(config),
+        pointnet_samples.make_blobs(np.random.default_rng(0), [1, 5, 30, 100, 7]),
     )
     network.temperature.fill_(1.5)
     network.offsets.copy_(torch.arange(4) / 10)
@@ -294,7 +307,7 @@ def convert_to_project(state, project):
 @pytest.fixture(scope="module")
 def full_state():
     """Return a v0 full network with ten inputs per point, as in those projects."""
-    return lively(make_config("v0", "full", middle_z=True)).state_dict()
+    return make_random_network(make_config("v0", "full", middle_z=True)).state_dict()
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from detection_samples import lively, tiny
+from detection_samples import make_random_network, make_tiny_config
 
 from lidar_perception.detectors.checkpoint import Header, read_arrays, save_checkpoint
 from lidar_perception.detectors.layer_weights import LayerWeights, WeightsMismatch, to_arrays
@@ -49,8 +49,8 @@ def test_detection_does_not_load_torch():
     ],
 )
 def test_tensors_of_another_network_are_rejected(change):
-    config = tiny("v4")
-    tensors = to_arrays(lively(config))
+    config = make_tiny_config("v4")
+    tensors = to_arrays(make_random_network(config))
     SparseNetwork(config, tensors)
     change(tensors)
     with pytest.raises(WeightsMismatch):
@@ -71,12 +71,13 @@ def test_folded_norm_equals_layer_and_norm():
 
 @needs_kernels
 def test_bf16_weights_are_read_by_torch(tmp_path):
-    config = tiny("v4")
+    config = make_tiny_config("v4")
     path = tmp_path / "w.safetensors"
     from safetensors.torch import save_file
 
     tensors = {
-        name: value.bfloat16() if value.ndim > 1 else value for name, value in lively(config).state_dict().items()
+        name: value.bfloat16() if value.ndim > 1 else value
+        for name, value in make_random_network(config).state_dict().items()
     }
     save_file(
         {name: value.contiguous() for name, value in tensors.items()},
@@ -88,10 +89,10 @@ def test_bf16_weights_are_read_by_torch(tmp_path):
 
 
 def test_checkpoint_arrays_equal_the_saved_ones(tmp_path):
-    network = lively(tiny("v4"))
-    save_checkpoint(tmp_path / "w", network, Header(tiny("v4")))
+    network = make_random_network(make_tiny_config("v4"))
+    save_checkpoint(tmp_path / "w", network, Header(make_tiny_config("v4")))
     header, tensors = read_arrays(tmp_path / "w", NetworkConfig)
-    assert header.config == tiny("v4")
+    assert header.config == make_tiny_config("v4")
     assert {*tensors} == {*network.state_dict()}
     for name, value in network.state_dict().items():
         np.testing.assert_array_equal(tensors[name], value.numpy())

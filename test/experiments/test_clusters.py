@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import crowd_folder
+from samples import write_crowd_folder
 
 from experiments.clusters.experiment import SEGMENTATION
 from experiments.clusters.range_image import cluster_range_image
@@ -18,7 +18,7 @@ from lidar_perception.scoring.points.segmentation import Objects
 from lidar_perception.types import InputError
 
 
-def objects(owner, region=None):
+def make_objects(owner, region=None):
     owner = np.asarray(owner, np.int32)
     region = owner if region is None else np.asarray(region, np.int32)
     count = int(owner.max(initial=0))
@@ -27,7 +27,7 @@ def objects(owner, region=None):
 
 def scores(ids, owner, ground=None, region=None):
     ground = np.zeros(len(owner), bool) if ground is None else np.asarray(ground, bool)
-    counts = count_points(np.asarray(ids, np.int32), ground, objects(owner, region))
+    counts = count_points(np.asarray(ids, np.int32), ground, make_objects(owner, region))
     return dict(zip(COUNT_COLUMNS, counts)), compute_scores(np.array(counts, float)).tolist()
 
 
@@ -70,16 +70,16 @@ def test_object_scores_equal_hand_computed_values():
     assert (recall, precision, f1, iou) == pytest.approx((50, 200 / 3, 400 / 7, 62.5))
 
 
-def panel(x, y, width=1.0):
+def make_panel(x, y, width=1.0):
     """Return points of a wall of 1 x 1 m at (x, y), seen from the front."""
     z, side = (g.ravel() for g in np.meshgrid(np.arange(-1, 0, 0.05), np.arange(0, width, 0.03)))
     return np.stack([np.full(len(z), x), y + side, z], axis=1).astype(np.float32)
 
 
 def test_range_image_separates_an_object_from_the_one_behind():
-    xyz = np.concatenate([panel(10, 0), panel(14, 1.43), panel(10, 4), panel(-10, 0)])
+    xyz = np.concatenate([make_panel(10, 0), make_panel(14, 1.43), make_panel(10, 4), make_panel(-10, 0)])
     ids = cluster_range_image(xyz)
-    sizes = [len(panel(10, 0))] * 4
+    sizes = [len(make_panel(10, 0))] * 4
     groups = np.split(ids, np.cumsum(sizes)[:-1])
     labels = [np.bincount(group).argmax() for group in groups]
     assert len(set(labels)) == 4 and 0 not in labels
@@ -88,15 +88,15 @@ def test_range_image_separates_an_object_from_the_one_behind():
 
 
 def test_range_image_clusters_span_the_180_degree_border():
-    behind = panel(-10, -0.5)  # where the azimuth jumps from 180 to -180 degrees
+    behind = make_panel(-10, -0.5)  # where the azimuth jumps from 180 to -180 degrees
     assert len(np.unique(cluster_range_image(behind))) == 1
-    assert (cluster_range_image(panel(10, 0)[:5]) == 0).all()
+    assert (cluster_range_image(make_panel(10, 0)[:5]) == 0).all()
     assert cluster_range_image(np.zeros((0, 3), np.float32)).shape == (0,)
 
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory):
-    return open_recording(crowd_folder(tmp_path_factory.mktemp("kitti"), 3)).frames
+    return open_recording(write_crowd_folder(tmp_path_factory.mktemp("kitti"), 3)).frames
 
 
 def test_report_is_complete_with_and_without_records(frames):

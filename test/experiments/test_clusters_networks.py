@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from pointnet_samples import lively, small
+from pointnet_samples import make_random_network, make_small_config
 
 from experiments.__main__ import cli
 from experiments.clusters import detection_tables, drives, networks
@@ -41,7 +41,7 @@ SENSOR = "generic:16,-20,5,2,10"
 
 
 @pytest.fixture(scope="module")
-def coarse():
+def coarse_drives():
     """Simulated drives of three scans of a sensor with few points."""
     with pytest.MonkeyPatch.context() as patch:
         sensor, simulate = find_sensor(SENSOR), drive.simulate_drive
@@ -54,13 +54,13 @@ def coarse():
 
 
 @pytest.fixture(scope="module")
-def models(tmp_path_factory):
+def random_models(tmp_path_factory):
     """Networks with random weights in place of trained ones."""
     folder, found = tmp_path_factory.mktemp("models"), {}
     for seed, name in ((0, "improved"), (1, "improved"), (0, "base"), (0, "farthest")):
-        config = small(name)
+        config = make_small_config(name)
         path = folder / f"{name}{seed}.safetensors"
-        save_checkpoint(path, lively(config, seed), Header(config))
+        save_checkpoint(path, make_random_network(config, seed), Header(config))
         model = Model(networks.name_model(name, seed), PointNetTraining())
         found[model.name] = TrainedModel(model, path, 2, 1.5, 2, 4, 1000)
     return found
@@ -72,11 +72,11 @@ def frames():
     return [Frame.of(f"scan {i}", scan.frame, scan.truth) for i, scan in enumerate(scans)]
 
 
-def test_report_is_complete_with_and_without_records(coarse, models, frames):
-    experiment = CLUSTERS.with_models(models)
+def test_report_is_complete_with_and_without_records(coarse_drives, random_models, frames):
+    experiment = CLUSTERS.with_models(random_models)
     records = [experiment.measure(frames, i) for i in range(2)]
     assert json.loads(json.dumps(records, allow_nan=False)) == records
-    assert [*records[0]["found"]] == [*models, *SHIPPED]
+    assert [*records[0]["found"]] == [*random_models, *SHIPPED]
     assert [*records[0]["changed"]["10 %"]] == ["improved, seed 0", *SHIPPED]
     assert len(records[0]["drive"]) == 3 and records[1]["drive"] is None
     for some in ([], [{"frame": "x", "skipped": "why"}], records):
@@ -101,7 +101,7 @@ def test_report_is_complete_with_and_without_records(coarse, models, frames):
     assert without[6].value == 1.0 != tracked[6].value and tracked[2].paper is not None
 
 
-def test_shipped_detectors_need_no_training(coarse, frames):
+def test_shipped_detectors_need_no_training(coarse_drives, frames):
     records = [SHIPPED_EXPERIMENT.measure(frames, i) for i in range(2)]
     assert [*records[0]["found"]] == [*records[0]["changed"]["10 %"]] == [*SHIPPED]
     sections = SHIPPED_EXPERIMENT.make_sections(records)
@@ -111,7 +111,7 @@ def test_shipped_detectors_need_no_training(coarse, frames):
     assert all(row[5].value > 0 for row in tables["table_8"].rows)  # milliseconds
 
 
-def test_experiment_without_training_runs_on_simulated_scans(tmp_path, coarse):
+def test_experiment_without_training_runs_on_simulated_scans(tmp_path, coarse_drives):
     command = ["reproduce", "clusters-shipped", "sim", "--limit", "1", "--jobs", "1", "--out"]
     result = CliRunner().invoke(cli, [*command, str(tmp_path / "out")])
     assert result.exit_code == 0, result.output
@@ -138,7 +138,7 @@ def test_every_network_of_the_tables_can_be_trained():
     assert {*COMPARED} - {*SHIPPED} <= {model.params.network for model in models if model.required}
 
 
-def test_tiny_budget_runs_end_to_end(tmp_path, coarse, monkeypatch):
+def test_tiny_budget_runs_end_to_end(tmp_path, coarse_drives, monkeypatch):
     monkeypatch.setattr(networks, "NETWORKS", ("improved",))
     result = CliRunner().invoke(
         cli,
@@ -185,7 +185,7 @@ def test_thinning_and_noise_are_reproducible(frames):
     assert np.abs(across).max() < 1e-4 and change_cloud(cloud, Change(), "a") is cloud
 
 
-def test_simulated_labels_have_velocities(coarse):
+def test_simulated_labels_have_velocities(coarse_drives):
     frames = simulate_key_frames(drives.FIRST_DRIVE)
     labels = [frame.native.labels() for frame in frames]
     speeds = np.linalg.norm(labels[1].boxes.velocities, axis=1)
@@ -197,7 +197,7 @@ def test_simulated_labels_have_velocities(coarse):
             np.testing.assert_allclose((moved[i] - centre)[:2], velocity * seconds, atol=0.3)
 
 
-def test_drive_starts_at_the_first_frame_of_a_scene(coarse, frames):
+def test_drive_starts_at_the_first_frame_of_a_scene(coarse_drives, frames):
     assert len(list_drive(frames, 0)) == 3 and list_drive(frames, 1) == ()
     key_frames = [
         replace(frame, native=simulate_key_frames(5)[0].native, sequence=name)

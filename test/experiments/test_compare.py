@@ -10,10 +10,10 @@ import detection_samples
 import numpy as np
 import pointnet_samples
 import pytest
-from cli_samples import error_line, exit_of
+from cli_samples import read_error_line, run_main
 from click.testing import CliRunner
-from kitti_samples import tracking_folder
-from samples import crowd_folder, object_folder, walker_label, write
+from kitti_samples import write_tracking_folder
+from samples import make_walker_label, write_crowd_folder, write_file, write_object_folder
 
 from experiments.__main__ import cli, main
 from experiments.comparison.contenders import open_contenders
@@ -33,7 +33,7 @@ ROW = {"weights", "classes", "ap", "mean_ap", "pedestrian_centres", "ms", "ms_of
 
 
 @pytest.fixture
-def bare(monkeypatch, tmp_path):
+def package_without_weights(monkeypatch, tmp_path):
     """A copy of the package without weights."""
     monkeypatch.setattr(weights_file, "POINTPILLARS_WEIGHTS", tmp_path / "none")
     monkeypatch.setattr(weights_file, "POINTNET_WEIGHTS", tmp_path / "none.safetensors")
@@ -43,11 +43,11 @@ def bare(monkeypatch, tmp_path):
 def weights(tmp_path_factory):
     """Networks with random weights: PointPillars v0 compact twice, and a PointNet."""
     folder = tmp_path_factory.mktemp("weights")
-    config = detection_samples.tiny()
+    config = detection_samples.make_tiny_config()
     for name, seed in ("a", 0), ("b", 1):
-        save_checkpoint(folder / name, detection_samples.lively(config, seed), Header(config))
-    config = pointnet_samples.small()
-    save_checkpoint(folder / "c", pointnet_samples.lively(config), Header(config))
+        save_checkpoint(folder / name, detection_samples.make_random_network(config, seed), Header(config))
+    config = pointnet_samples.make_small_config()
+    save_checkpoint(folder / "c", pointnet_samples.make_random_network(config), Header(config))
     return folder
 
 
@@ -76,9 +76,9 @@ def copy_labels(frame, score=0.9) -> Detections:
     return Detections.of(truth.boxes, truth.class_ids, score)
 
 
-def test_all_detectors_run_and_missing_ones_are_listed(bare, weights, tmp_path, monkeypatch):
+def test_all_detectors_run_and_missing_ones_are_listed(package_without_weights, weights, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
-    root = crowd_folder(tmp_path / "kitti", 3)
+    root = write_crowd_folder(tmp_path / "kitti", 3)
     given = [word for name in "acb" for word in ("--weights", weights / name)]
     content, text = run(tmp_path, "--data", root, *given, "--device", "cpu")
     assert [*content["rows"]] == [*CANDIDATES, "PointPillars v0 compact", "PointNet", "PointPillars v0 compact #2"]
@@ -103,12 +103,12 @@ def test_all_detectors_run_and_missing_ones_are_listed(bare, weights, tmp_path, 
     assert max(map(len, lines)) <= 100 and "…" not in text
 
 
-def test_candidates_are_compared_in_any_layout(bare, tmp_path):
-    content, _ = run(tmp_path, "--data", tracking_folder(tmp_path / "kitti"), "--limit", 2)
+def test_candidates_are_compared_in_any_layout(package_without_weights, tmp_path):
+    content, _ = run(tmp_path, "--data", write_tracking_folder(tmp_path / "kitti"), "--limit", 2)
     assert [*content["rows"]] == CANDIDATES and content["frames"] == 2
     reasons = {each["name"]: each["reason"] for each in content["missing"]}
     assert len(reasons) == 12 and "--weights" in reasons["PointNet"]
-    frame, _ = open_recording(crowd_folder(tmp_path / "crowd", 2))  # like a bag without a camera
+    frame, _ = open_recording(write_crowd_folder(tmp_path / "crowd", 2))  # like a bag without a camera
     found, _ = open_contenders([], "cpu", 1.73)
     scan, blind = frame.load(), replace(frame, calibration=lambda: None)
     whole, cropped = ([len(each.make_detector(one)(scan).detections) for each in found] for one in (blind, frame))
@@ -116,7 +116,7 @@ def test_candidates_are_compared_in_any_layout(bare, tmp_path):
 
 
 def test_failing_detector_does_not_end_the_comparison(tmp_path):
-    root = object_folder(tmp_path, walker_label(), count=3)
+    root = write_object_folder(tmp_path, make_walker_label(), count=3)
 
     def fail(frame):
         if frame.name == "000001":
@@ -139,7 +139,7 @@ def test_failing_detector_does_not_end_the_comparison(tmp_path):
 
 
 def test_pedestrians_below_the_default_threshold_do_not_count(tmp_path):
-    root = object_folder(tmp_path, walker_label(), count=1)
+    root = write_object_folder(tmp_path, make_walker_label(), count=1)
 
     (row,) = compute_report(root, make_fake(lambda frame: copy_labels(frame, 0.2)))["rows"].values()
     row = row["pedestrian_centres"]
@@ -156,7 +156,7 @@ def test_detectors_run_in_turn_on_each_frame(tmp_path):
             assert sorted(order[place] for order in orders) == sorted(2 * items)
     calls = []
     compute_report(
-        object_folder(tmp_path, walker_label(), count=3),
+        write_object_folder(tmp_path, make_walker_label(), count=3),
         *(lambda frame, i=i: calls.append((frame.name, i)) for i in range(3)),
     )
     first, *rest = (calls[i : i + 3] for i in range(0, len(calls), 3))
@@ -165,23 +165,23 @@ def test_detectors_run_in_turn_on_each_frame(tmp_path):
 
 
 def test_unreadable_frames_are_skipped(tmp_path):
-    root = object_folder(tmp_path, walker_label(), count=2)
-    write(root / "training/velodyne/000000.bin", b"123")
+    root = write_object_folder(tmp_path, make_walker_label(), count=2)
+    write_file(root / "training/velodyne/000000.bin", b"123")
     content = compute_report(root, make_fake(lambda frame: Detections.none()))
     (line,) = content["skipped"]
     assert content["frames"] == content["rows"]["0"]["frames"] == 1 and "000000.bin" in line
 
 
 def test_mean_ignores_classes_without_labels(tmp_path):
-    root = object_folder(tmp_path, walker_label(), count=1)
+    root = write_object_folder(tmp_path, make_walker_label(), count=1)
     (row,) = compute_report(root, make_fake(lambda frame: Detections.none()))["rows"].values()
     assert row["mean_ap"] == dict.fromkeys(row["mean_ap"], 0.0)
     assert [row["ap"][name]["3d"]["moderate"] for name in SCORED] == [None, 0.0, None]
 
 
 @pytest.mark.parametrize("case", ["labels", "weights", "folder"])
-def test_bad_input_is_reported_in_one_line(case, bare, tmp_path, monkeypatch, capsys):
-    root = object_folder(tmp_path / "kitti")
+def test_bad_input_is_reported_in_one_line(case, package_without_weights, tmp_path, monkeypatch, capsys):
+    root = write_object_folder(tmp_path / "kitti")
     arguments = ["--data", root]
     if case == "labels":
         for path in (root / "training/label_2").iterdir():
@@ -192,5 +192,5 @@ def test_bad_input_is_reported_in_one_line(case, bare, tmp_path, monkeypatch, ca
         expected = f"checkpoint not found: {tmp_path / 'w'}"
     else:
         arguments, expected = ["--data", tmp_path / "none"], f"{tmp_path / 'none'} does not exist"
-    assert exit_of(monkeypatch, "compare", *arguments, run=main) == 2
-    assert expected in error_line(capsys)
+    assert run_main(monkeypatch, "compare", *arguments, run=main) == 2
+    assert expected in read_error_line(capsys)

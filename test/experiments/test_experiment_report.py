@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_samples import exit_of
+from cli_samples import run_main
 from click.testing import CliRunner
-from experiment_samples import SMALL, command, points_table
+from experiment_samples import SMALL, make_sections, run_reproduce
 
 from experiments.__main__ import COMMANDS, cli, main
 from experiments.framework.command import EXPERIMENTS, load_experiment
@@ -34,9 +34,9 @@ def test_skipped_frames_are_grouped_by_reason():
     assert (second["count"], second["names"]) == (1, ["x"])
 
 
-def test_report_escapes_text(few, tmp_path):
-    records = run_experiment(SMALL, open_recording(few), tmp_path / "out")
-    page = write_report(tmp_path / "out", SMALL, records, points_table(records), {"folder": "<b>"}).read_text()
+def test_report_escapes_text(five_scans, tmp_path):
+    records = run_experiment(SMALL, open_recording(five_scans), tmp_path / "out")
+    page = write_report(tmp_path / "out", SMALL, records, make_sections(records), {"folder": "<b>"}).read_text()
     for text in ("Small & <quick>", "<Points>", "Points | of <all>", "a <note>", "<b>"):
         assert html.escape(text) in page and text not in page
     markdown = (tmp_path / "out/report.md").read_text()
@@ -73,12 +73,12 @@ def test_figures_are_reproducible_with_and_without_points(kind):
 # The command
 
 
-def test_experiment_runs_by_its_name(few, tmp_path, monkeypatch):
+def test_experiment_runs_by_its_name(five_scans, tmp_path, monkeypatch):
     monkeypatch.setitem(EXPERIMENTS, "points", "experiment_samples:SMALL")
     out = tmp_path / "out"
-    text = command("points", "--data", few, "--out", out, "--jobs", 1)
+    text = run_reproduce("points", "--data", five_scans, "--out", out, "--jobs", 1)
     assert "skipped 1: three is not liked" in text
-    expected = [len(frame.load()) for frame in open_recording(few)]
+    expected = [len(frame.load()) for frame in open_recording(five_scans)]
     rows = list(csv.DictReader((out / "tables/points.csv").open()))
     assert [float(r["points"]) for r in rows] == np.delete(expected, 3).tolist()
 
@@ -103,7 +103,7 @@ def test_invalid_arguments_are_reported_before_writing(tmp_path, arguments, word
 def test_data_is_argument_or_option_but_not_both(tmp_path, monkeypatch, capsys):
     errors = []
     for words in (["none"], ["--data", "none"], ["none", "--data", "none"], []):
-        assert exit_of(monkeypatch, "reproduce", "stm-cpa", *words, "--out", tmp_path / "out", run=main) == 2
+        assert run_main(monkeypatch, "reproduce", "stm-cpa", *words, "--out", tmp_path / "out", run=main) == 2
         errors.append(capsys.readouterr().err.splitlines()[-1])
     assert errors[0] == errors[1] and "none does not exist" in errors[0]
     assert "expected one DATA" in errors[2] and "DATA is missing" in errors[3]

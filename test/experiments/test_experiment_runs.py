@@ -17,8 +17,17 @@ from multiprocessing import forkserver
 from pathlib import Path
 
 import pytest
-from experiment_samples import COUNT, SMALL, command, count_points, points_table, read_lines, small, untimed
-from samples import object_folder, wait_for_the_end, write
+from experiment_samples import (
+    COUNT,
+    SMALL,
+    count_points,
+    make_sections,
+    make_small_experiment,
+    read_lines,
+    read_untimed_records,
+    run_reproduce,
+)
+from samples import wait_for_the_end, write_file, write_object_folder
 
 from experiments.framework import report_files
 from experiments.framework.experiment import Cell
@@ -62,7 +71,7 @@ def read_untimed_files(folder):
 # Processes and interruptions
 
 
-def test_dask_cluster_gives_the_same_records(crowds, whole, tmp_path):
+def test_dask_cluster_gives_the_same_records(crowd_recording, paper_run, tmp_path):
     distributed = pytest.importorskip("distributed", reason="needs the extra [distributed]")
     from dask import config
 
@@ -72,29 +81,42 @@ def test_dask_cluster_gives_the_same_records(crowds, whole, tmp_path):
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
     ):
         address = cluster.scheduler_address
-        run_experiment(STM_CPA, open_recording(crowds), tmp_path / "out", dask=address)
+        run_experiment(STM_CPA, open_recording(crowd_recording), tmp_path / "out", dask=address)
         with pytest.raises(ZeroDivisionError):
-            run_experiment(small(raise_bug), open_recording(crowds), tmp_path / "broken", dask=address)
-    assert untimed(tmp_path / "out") == untimed(whole)
+            run_experiment(
+                make_small_experiment(raise_bug), open_recording(crowd_recording), tmp_path / "broken", dask=address
+            )
+    assert read_untimed_records(tmp_path / "out") == read_untimed_records(paper_run)
 
 
-def test_error_names_the_unreachable_scheduler(few, tmp_path, monkeypatch):
+def test_error_names_the_unreachable_scheduler(five_scans, tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="needs the extra [distributed]")
     monkeypatch.setattr(scoring_run, "CONNECT_TIMEOUT_S", 0.2)
     with pytest.raises(InputError, match="cannot reach a Dask scheduler"):
-        run_experiment(SMALL, open_recording(few), tmp_path / "out", dask="tcp://127.0.0.1:9")
+        run_experiment(SMALL, open_recording(five_scans), tmp_path / "out", dask="tcp://127.0.0.1:9")
 
 
-def test_missing_distributed_names_the_extra(few, tmp_path, monkeypatch):
+def test_missing_distributed_names_the_extra(five_scans, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"lidar_perception\[distributed\]"):
-        run_experiment(SMALL, open_recording(few), tmp_path / "out", dask="tcp://127.0.0.1:9")
+        run_experiment(SMALL, open_recording(five_scans), tmp_path / "out", dask="tcp://127.0.0.1:9")
 
 
-def test_killed_run_of_two_processes_resumes(crowds, whole, tmp_path):
+def test_killed_run_of_two_processes_resumes(crowd_recording, paper_run, tmp_path):
     out = tmp_path / "out"
     process = subprocess.Popen(
-        [sys.executable, "-m", "experiments", "reproduce", "--data", str(crowds), "--out", str(out), "--jobs", "2"],
+        [
+            sys.executable,
+            "-m",
+            "experiments",
+            "reproduce",
+            "--data",
+            str(crowd_recording),
+            "--out",
+            str(out),
+            "--jobs",
+            "2",
+        ],
         cwd=ROOT,
         start_new_session=True,
         text=True,
@@ -110,24 +132,24 @@ def test_killed_run_of_two_processes_resumes(crowds, whole, tmp_path):
     assert "Traceback" not in process.communicate()[1]
     kept = read_lines(out)
     assert 4 <= len(kept)  # on a busy machine all may be measured before the signal comes
-    command("--data", crowds, "--out", out, "--jobs", 1)
-    assert untimed(out) == untimed(whole)
-    assert read_untimed_files(out) == read_untimed_files(whole)
+    run_reproduce("--data", crowd_recording, "--out", out, "--jobs", 1)
+    assert read_untimed_records(out) == read_untimed_records(paper_run)
+    assert read_untimed_files(out) == read_untimed_files(paper_run)
     assert set(kept[:4]) <= set(read_lines(out))  # times are equal, so they were not measured again
 
 
 @pytest.mark.parametrize("cut", [1, 2, 40])
-def test_truncated_last_record_is_measured_again(few, tmp_path, cut):
-    expected = run_experiment(SMALL, open_recording(few), tmp_path / "out")
+def test_truncated_last_record_is_measured_again(five_scans, tmp_path, cut):
+    expected = run_experiment(SMALL, open_recording(five_scans), tmp_path / "out")
     path = tmp_path / "out" / journal.JOURNAL_NAME
     bytes_before = path.read_bytes()
     path.write_bytes(bytes_before[:-cut])
-    assert run_experiment(SMALL, open_recording(few), tmp_path / "out") == expected
+    assert run_experiment(SMALL, open_recording(five_scans), tmp_path / "out") == expected
     assert path.read_bytes() == bytes_before
 
 
-def test_finished_frames_are_not_measured_again(few, tmp_path, monkeypatch):
-    expected = run_experiment(SMALL, open_recording(few), tmp_path / "out", limit=2)
+def test_finished_frames_are_not_measured_again(five_scans, tmp_path, monkeypatch):
+    expected = run_experiment(SMALL, open_recording(five_scans), tmp_path / "out", limit=2)
     assert [r["frame"] for r in expected] == ["000000", "000001"]
     asked = []
 
@@ -135,81 +157,81 @@ def test_finished_frames_are_not_measured_again(few, tmp_path, monkeypatch):
         asked.append(number)
         return count_points(frames, number)
 
-    recording, out = open_recording(few), tmp_path / "out"
-    assert run_experiment(small(log_measure), recording, out)[:2] == expected
+    recording, out = open_recording(five_scans), tmp_path / "out"
+    assert run_experiment(make_small_experiment(log_measure), recording, out)[:2] == expected
     assert asked == [2, 3, 4]
-    assert len(run_experiment(small(log_measure), recording, out, limit=1)) == 1
+    assert len(run_experiment(make_small_experiment(log_measure), recording, out, limit=1)) == 1
     assert asked == [2, 3, 4]
     assert len(read_lines(tmp_path / "out")) == 1 + 4  # the plan, and frames that were not skipped
 
 
-def test_skipped_frame_is_tried_again(few, tmp_path):
-    scan = few / "training/velodyne/000001.bin"
+def test_skipped_frame_is_tried_again(five_scans, tmp_path):
+    scan = five_scans / "training/velodyne/000001.bin"
     whole = scan.read_bytes()
     scan.write_bytes(whole[:100])
-    first = run_experiment(SMALL, open_recording(few), tmp_path / "out")
+    first = run_experiment(SMALL, open_recording(five_scans), tmp_path / "out")
     assert "000001.bin" in first[1]["skipped"] and "000001.bin" in first[2]["skipped"]
     scan.write_bytes(whole)
-    resumed, fresh = (run_experiment(SMALL, open_recording(few), tmp_path / name) for name in ("out", "again"))
+    resumed, fresh = (run_experiment(SMALL, open_recording(five_scans), tmp_path / name) for name in ("out", "again"))
     assert resumed == fresh
 
 
 # Output folders with other content
 
 
-def test_error_names_the_changed_settings(few, tmp_path):
+def test_error_names_the_changed_settings(five_scans, tmp_path):
     out = tmp_path / "out"
-    run_experiment(small(limits=(1, 2), deep={"a": 1, "b": 2}), open_recording(few), out)
+    run_experiment(make_small_experiment(limits=(1, 2), deep={"a": 1, "b": 2}), open_recording(five_scans), out)
     before = (out / journal.JOURNAL_NAME).read_bytes()
     with pytest.raises(InputError, match=r"settings.deep.b 2, not 3\).*--force") as error:
-        run_experiment(small(limits=(1, 2), deep={"a": 1, "b": 3}), open_recording(few), out)
+        run_experiment(make_small_experiment(limits=(1, 2), deep={"a": 1, "b": 3}), open_recording(five_scans), out)
     assert "deep.a" not in str(error.value) and "limits" not in str(error.value)
-    other = object_folder(tmp_path / "other", count=4)
+    other = write_object_folder(tmp_path / "other", count=4)
     with pytest.raises(InputError, match=r"data '.*few', not '.*other'; frames 5, not 4"):
-        run_experiment(small(limits=(1, 2), deep={"a": 1, "b": 2}), open_recording(other), out)
+        run_experiment(make_small_experiment(limits=(1, 2), deep={"a": 1, "b": 2}), open_recording(other), out)
     assert (out / journal.JOURNAL_NAME).read_bytes() == before
     run_experiment(SMALL, open_recording(other), out, force=True)
     assert len(run_experiment(SMALL, open_recording(other), out)) == 4
 
 
-def test_folder_with_other_files_is_not_changed(few, tmp_path):
+def test_folder_with_other_files_is_not_changed(five_scans, tmp_path):
     out = tmp_path / "mine"
-    write(out / "letter.txt", "dear")
-    write(out / "figures/photo.png", "me")
+    write_file(out / "letter.txt", "dear")
+    write_file(out / "figures/photo.png", "me")
     with pytest.raises(InputError, match=f"{out} already exists.*--force"):
-        run_experiment(SMALL, open_recording(few), out)
+        run_experiment(SMALL, open_recording(five_scans), out)
     assert sorted(p.name for p in out.rglob("*.*")) == ["letter.txt", "photo.png"]
-    run_experiment(SMALL, open_recording(few), out, force=True)
+    run_experiment(SMALL, open_recording(five_scans), out, force=True)
     assert (out / "letter.txt").read_text() == "dear" and (out / "figures/photo.png").exists()
     with pytest.raises(InputError, match="is a file"):
-        run_experiment(SMALL, open_recording(few), out / "letter.txt")
+        run_experiment(SMALL, open_recording(five_scans), out / "letter.txt")
     with pytest.raises(InputError, match="cannot create the folder"):
-        run_experiment(SMALL, open_recording(few), out / "letter.txt/deeper")
+        run_experiment(SMALL, open_recording(five_scans), out / "letter.txt/deeper")
 
 
-def test_force_removes_files_of_the_old_run_only(whole, few, tmp_path):
-    out = shutil.copytree(whole, tmp_path / "out")
-    theirs = {write(out / "tables/mine.csv", "me"), write(out / "figures/photo.png", "me")}
-    records = run_experiment(SMALL, open_recording(few), out, force=True)
+def test_force_removes_files_of_the_old_run_only(paper_run, five_scans, tmp_path):
+    out = shutil.copytree(paper_run, tmp_path / "out")
+    theirs = {write_file(out / "tables/mine.csv", "me"), write_file(out / "figures/photo.png", "me")}
+    records = run_experiment(SMALL, open_recording(five_scans), out, force=True)
     assert {*out.rglob("*.*")} == {out / journal.JOURNAL_NAME, *theirs}
-    write_report(out, SMALL, records, points_table(records), {})
+    write_report(out, SMALL, records, make_sections(records), {})
     assert {p.stem for p in out.rglob("*.csv")} == {"points", "mine"}
 
 
 @pytest.mark.parametrize("first", ["", "{", "[]", '{"frame": "000000"}'])
-def test_journal_without_plan_is_not_resumed(few, tmp_path, first):
-    write(tmp_path / "out" / journal.JOURNAL_NAME, first + "\n")
+def test_journal_without_plan_is_not_resumed(five_scans, tmp_path, first):
+    write_file(tmp_path / "out" / journal.JOURNAL_NAME, first + "\n")
     with pytest.raises(InputError, match=r"cannot read .*--force"):
-        run_experiment(SMALL, open_recording(few), tmp_path / "out")
-    assert len(run_experiment(SMALL, open_recording(few), tmp_path / "out", force=True)) == 5
+        run_experiment(SMALL, open_recording(five_scans), tmp_path / "out")
+    assert len(run_experiment(SMALL, open_recording(five_scans), tmp_path / "out", force=True)) == 5
 
 
-def test_folder_is_locked_by_a_run(few, tmp_path):
+def test_folder_is_locked_by_a_run(five_scans, tmp_path):
     with journal.open_journal(tmp_path / "out", {}) as _, pytest.raises(InputError, match="another process"):
-        run_experiment(SMALL, open_recording(few), tmp_path / "out", force=True)
+        run_experiment(SMALL, open_recording(five_scans), tmp_path / "out", force=True)
 
 
-def test_full_disk_is_reported_in_one_line_and_run_resumes(few, tmp_path, monkeypatch):
+def test_full_disk_is_reported_in_one_line_and_run_resumes(five_scans, tmp_path, monkeypatch):
     def raise_disk_full(self):
         raise OSError(28, "No space left on device")
 
@@ -217,29 +239,29 @@ def test_full_disk_is_reported_in_one_line_and_run_resumes(few, tmp_path, monkey
         patch.setattr(journal, "SYNC_S", -1.0)
         patch.setattr(journal.Journal, "sync", raise_disk_full)
         with pytest.raises(InputError, match=r"No space left.*the same command resumes"):
-            run_experiment(SMALL, open_recording(few), tmp_path / "out")
-    assert len(run_experiment(SMALL, open_recording(few), tmp_path / "out")) == 5
+            run_experiment(SMALL, open_recording(five_scans), tmp_path / "out")
+    assert len(run_experiment(SMALL, open_recording(five_scans), tmp_path / "out")) == 5
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_exception_in_an_experiment_ends_the_run(few, tmp_path, jobs, capfd):
+def test_exception_in_an_experiment_ends_the_run(five_scans, tmp_path, jobs, capfd):
     if jobs > 1:
         forkserver._forkserver._stop()  # the server's processes still print to its original stderr
     with pytest.raises((ZeroDivisionError, InputError)) as error:
-        run_experiment(small(raise_bug), open_recording(few), tmp_path / "out", jobs=jobs)
+        run_experiment(make_small_experiment(raise_bug), open_recording(five_scans), tmp_path / "out", jobs=jobs)
     said = capfd.readouterr().err + "".join(getattr(error.value, "__notes__", []))
     assert "while processing frame 000002" in said
     assert '"000002"' not in "".join(read_lines(tmp_path / "out"))
 
 
-def test_record_that_is_not_json_is_rejected(few, tmp_path):
+def test_record_that_is_not_json_is_rejected(five_scans, tmp_path):
     with pytest.raises(ValueError, match="JSON"):
-        run_experiment(small(measure_nan), open_recording(few), tmp_path / "out")
+        run_experiment(make_small_experiment(measure_nan), open_recording(five_scans), tmp_path / "out")
 
 
-def test_run_ends_with_reason_if_worker_is_killed(few, tmp_path):
+def test_run_ends_with_reason_if_worker_is_killed(five_scans, tmp_path):
     with pytest.raises(InputError, match=r"measured frames.*out of memory: try fewer --jobs"):
-        run_experiment(small(kill_process), open_recording(few), tmp_path / "out", jobs=2)
+        run_experiment(make_small_experiment(kill_process), open_recording(five_scans), tmp_path / "out", jobs=2)
 
 
 # Broken frames
@@ -259,9 +281,9 @@ BROKEN = {
 }
 
 
-def test_broken_frame_is_skipped_without_changing_others(crowds, whole, tmp_path):
+def test_broken_frame_is_skipped_without_changing_others(crowd_recording, paper_run, tmp_path):
     root = tmp_path / "kitti"
-    shutil.copytree(crowds, root)
+    shutil.copytree(crowd_recording, root)
     for name, change in BROKEN.items():
         path = root / "training" / name
         if change is None:
@@ -277,19 +299,19 @@ def test_broken_frame_is_skipped_without_changing_others(crowds, whole, tmp_path
         assert frame in reason and len(reason.splitlines()) == 1, reason
         named = "velodyne/000004.bin" if name == "label_2/000004.txt" else name
         assert (named if named != "velodyne/000008.bin" else "label_2/000008.txt") in reason
-    expected = {r["frame"]: r for r in untimed(whole)}
+    expected = {r["frame"]: r for r in read_untimed_records(paper_run)}
     for name, record in records.items():
         if "skipped" not in record:
             assert {k: v for k, v in record.items() if k != "ms"} == expected[name]
     assert sum("skipped" not in r for r in records.values()) == COUNT - len(BROKEN) - 1
 
 
-def test_split_selects_frames(few, tmp_path):
-    (few / "training/velodyne/000004.bin").unlink()
-    split = write(tmp_path / "split.txt", "000002\n000000\n")
-    whole = open_recording(few)
+def test_split_selects_frames(five_scans, tmp_path):
+    (five_scans / "training/velodyne/000004.bin").unlink()
+    split = write_file(tmp_path / "split.txt", "000002\n000000\n")
+    whole = open_recording(five_scans)
     assert [name for name, _ in whole.missing_scans] == ["000004"]
-    records = run_experiment(SMALL, open_recording(few, split=split), tmp_path / "out")
+    records = run_experiment(SMALL, open_recording(five_scans, split=split), tmp_path / "out")
     assert [(r["frame"], "skipped" in r) for r in records] == [("000002", False), ("000000", False)]
     assert [r["frame"] for r in run_experiment(SMALL, whole, tmp_path / "all")][-1] == "000004"
 
@@ -300,21 +322,21 @@ def test_folder_without_scans_or_pedestrians_is_rejected(tmp_path):
         (tmp_path, "is not a recording in a supported format"),
     ):
         with pytest.raises(InputError, match=words):
-            command("--data", argument, "--out", tmp_path / "out")
+            run_reproduce("--data", argument, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
-    nobody = object_folder(tmp_path / "nobody", "")
+    nobody = write_object_folder(tmp_path / "nobody", "")
     with pytest.raises(InputError, match=r"no frame could be measured.*no Pedestrian"):
-        command("--data", nobody, "--out", tmp_path / "out", "--jobs", 1)
+        run_reproduce("--data", nobody, "--out", tmp_path / "out", "--jobs", 1)
     assert json.loads((tmp_path / "out/report.json").read_text())["skipped"] == 2
 
 
 # The report and the summary
 
 
-def test_every_format_has_every_table_and_figure(whole):
-    report = json.loads((whole / "report.json").read_text())
-    page = html.unescape((whole / "report.html").read_text())
-    markdown = (whole / "report.md").read_text()
+def test_every_format_has_every_table_and_figure(paper_run):
+    report = json.loads((paper_run / "report.json").read_text())
+    page = html.unescape((paper_run / "report.html").read_text())
+    markdown = (paper_run / "report.md").read_text()
     tables = [t for section in report["sections"] for t in section["tables"]]
     assert {t["name"] for t in tables} >= {
         "table_1",
@@ -327,11 +349,11 @@ def test_every_format_has_every_table_and_figure(whole):
         "search_best",
         "figure_8",
     }
-    assert {p.stem for p in (whole / "tables").iterdir()} == {t["name"] for t in tables}
+    assert {p.stem for p in (paper_run / "tables").iterdir()} == {t["name"] for t in tables}
     for table in tables:
         assert table["title"] in page and f"**{table['title']}**" in markdown
         rows = [[Cell(**c) if isinstance(c, dict) else c for c in row] for row in table["rows"]]
-        read = list(csv.DictReader((whole / f"tables/{table['name']}.csv").open()))
+        read = list(csv.DictReader((paper_run / f"tables/{table['name']}.csv").open()))
         assert len(read) == len(rows)
         for row, there in zip(rows, read):
             for name, cell in zip(table["header"], row):
@@ -349,29 +371,29 @@ def test_every_format_has_every_table_and_figure(whole):
                 assert value in page and interval in page and interval in markdown
                 assert not published or (f"paper {published}" in page and f"(paper {published})" in markdown)
     for figure in (f for section in report["sections"] for f in section["figures"]):
-        picture = whole / f"figures/{figure['name']}.png"
+        picture = paper_run / f"figures/{figure['name']}.png"
         assert picture.read_bytes().startswith(b"\x89PNG")
         assert figure["title"] in page and f"(figures/{figure['name']}.png)" in markdown
-    assert {p for p in whole.rglob("*") if p.is_file()} == {
-        whole / journal.JOURNAL_NAME,
-        *report_files.list_report_files(whole),
+    assert {p for p in paper_run.rglob("*") if p.is_file()} == {
+        paper_run / journal.JOURNAL_NAME,
+        *report_files.list_report_files(paper_run),
     }
 
 
-def test_page_is_self_contained_and_describes_the_run(whole, crowds):
-    page = (whole / "report.html").read_text()
+def test_page_is_self_contained_and_describes_the_run(paper_run, crowd_recording):
+    page = (paper_run / "report.html").read_text()
     assert not re.findall(r'(?:src|href|srcset)="(?!data:|#)', page) and "<script" not in page
-    assert str(crowds) in page and "11 measured, 1 skipped" in page and "lidar_perception" in page
+    assert str(crowd_recording) in page and "11 measured, 1 skipped" in page and "lidar_perception" in page
     assert "no Pedestrian label" in page
-    report = json.loads((whole / "report.json").read_text())
+    report = json.loads((paper_run / "report.json").read_text())
     assert (report["measured"], report["skipped"]) == (11, 1)
     assert [r["frame"] for r in report["skipped_frames"]] == ["000011"]
 
 
-def test_summary_shows_scores_next_to_those_of_the_paper(whole):
-    text = (whole.parent / "said").read_text()
-    report = json.loads((whole / "report.json").read_text())
+def test_summary_shows_scores_next_to_those_of_the_paper(paper_run):
+    text = (paper_run.parent / "said").read_text()
+    report = json.loads((paper_run / "report.json").read_text())
     row = next(t for s in report["sections"] for t in s["tables"] if t["name"] == "table_3_6")["rows"][2]
     assert f"{row[1]['value']:.1f} (46.7)" in text and f"{row[3]['value']:.1f} (52.1)" in text
-    assert f"report: {whole}/report.html" in text.replace("\n", "")
+    assert f"report: {paper_run}/report.html" in text.replace("\n", "")
     assert "skipped 1: no Pedestrian" in text

@@ -20,11 +20,11 @@ from experiments.framework.statistics import (
 seeds = st.integers(0, 2**32 - 1)
 
 
-def share(sums):
+def compute_fraction(sums):
     return divide(sums[..., :1], sums[..., :1] + sums[..., 1:])
 
 
-def hits(frames, rate, rng):
+def draw_hits(frames, rate, rng):
     """Hits and misses (F, 2) with one case per frame."""
     hit = rng.uniform(size=frames) < rate
     return np.column_stack([hit, ~hit])
@@ -34,23 +34,23 @@ def hits(frames, rate, rng):
 def test_interval_contains_the_value(seed, frames, rate):
     rng = np.random.default_rng(seed)
     counts = rng.poisson(3, (frames, 2)) * [rate, 1 - rate]
-    value, low, high = bootstrap(counts, share)
+    value, low, high = bootstrap(counts, compute_fraction)
     assert (low < value).all() and (value < high).all()
     assert value[0] == pytest.approx(counts[:, 0].sum() / counts.sum())
 
 
 @given(seeds, st.floats(0.2, 0.8))
 def test_interval_of_a_fraction_agrees_with_binomial(seed, rate):
-    counts = hits(1000, rate, np.random.default_rng(seed))
-    (value,), (low,), (high,) = bootstrap(counts, share)
+    counts = draw_hits(1000, rate, np.random.default_rng(seed))
+    (value,), (low,), (high,) = bootstrap(counts, compute_fraction)
     expected = 2 * 1.96 * np.sqrt(value * (1 - value) / 1000)
     assert high - low == pytest.approx(expected, rel=0.12)
     assert (low + high) / 2 == pytest.approx(value, abs=0.1 * expected)
 
 
 def test_four_times_the_frames_halve_the_interval():
-    counts = hits(500, 0.4, np.random.default_rng(5))
-    narrow, wide = (np.ptp(bootstrap(np.tile(counts, (n, 1)), share)[1:]) for n in (4, 1))
+    counts = draw_hits(500, 0.4, np.random.default_rng(5))
+    narrow, wide = (np.ptp(bootstrap(np.tile(counts, (n, 1)), compute_fraction)[1:]) for n in (4, 1))
     assert wide / narrow == pytest.approx(2.0, rel=0.1)
 
 
@@ -63,7 +63,7 @@ def test_interval_covers_truth_at_its_level():
         rate = rng.beta(4, 4, size=120)
         cases = rng.poisson(5, size=120)
         found = rng.binomial(cases, rate)
-        _, (low,), (high,) = bootstrap(np.column_stack([found, cases - found]), share, params)
+        _, (low,), (high,) = bootstrap(np.column_stack([found, cases - found]), compute_fraction, params)
         inside += low <= 0.5 <= high
     assert 0.90 <= inside / 200 <= 0.99
 
@@ -82,24 +82,24 @@ def test_bootstrap_weights_sum_to_the_number_of_blocks():
 
 @pytest.mark.parametrize("counts", [np.full((50, 2), 3), [[7, 2]], [[0, 0], [4, 4], [0, 0]]])
 def test_equal_frames_give_an_interval_of_zero_width(counts):
-    value, low, high = bootstrap(np.array(counts), share)
+    value, low, high = bootstrap(np.array(counts), compute_fraction)
     assert value == low == high == pytest.approx(np.sum(counts, axis=0)[0] / np.sum(counts))
 
 
 @pytest.mark.parametrize("counts", [np.zeros((0, 2)), np.zeros((8, 2))])
 def test_value_without_cases_is_missing(counts):
-    assert np.isnan(bootstrap(counts, share)).all()
-    (cell,) = make_cells(bootstrap(counts, share))
+    assert np.isnan(bootstrap(counts, compute_fraction)).all()
+    (cell,) = make_cells(bootstrap(counts, compute_fraction))
     assert (cell.value, cell.low, cell.high, cell.paper) == (None, None, None, None)
 
 
 def test_interval_depends_on_seed_and_not_on_block_size(monkeypatch):
     counts = np.random.default_rng(1).poisson(3, (40, 2))
-    first = bootstrap(counts, share)
-    np.testing.assert_array_equal(first, bootstrap(counts, share))
-    assert not np.array_equal(first, bootstrap(counts, share, BootstrapParams(seed=1)))
+    first = bootstrap(counts, compute_fraction)
+    np.testing.assert_array_equal(first, bootstrap(counts, compute_fraction))
+    assert not np.array_equal(first, bootstrap(counts, compute_fraction, BootstrapParams(seed=1)))
     monkeypatch.setattr("experiments.framework.statistics.MAX_DRAWS", 130)
-    np.testing.assert_array_equal(first, bootstrap(counts, share))
+    np.testing.assert_array_equal(first, bootstrap(counts, compute_fraction))
 
 
 def test_intervals_of_an_array_equal_those_of_its_elements():

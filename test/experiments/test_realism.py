@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from rich.console import Console
-from samples import CALIBRATION, calibration_text, object_folder, scene, walker_label, write
+from samples import CALIBRATION, make_calibration_text, make_scene, make_walker_label, write_file, write_object_folder
 
 from experiments.realism import command
 from experiments.realism.compare import (
@@ -78,7 +78,7 @@ def make_scan(seed: int, points: int = 500) -> Frame:
     return Frame.of(str(seed), PointCloud(xyz, intensity), GroundTruth.of(boxes, ids, extras), CALIBRATION)
 
 
-def with_scan(frame: Frame, scan: PointCloud) -> Frame:
+def replace_scan(frame: Frame, scan: PointCloud) -> Frame:
     """Return the frame with other points."""
     return Frame.of(frame.name, scan, frame.truth(), frame.calibration())
 
@@ -91,13 +91,13 @@ def compute_rows(frame: Frame) -> dict:
 def change_scans(change, count: int = SCANS) -> list[Frame]:
     """Return the street's scans after a change of every frame."""
     return [
-        with_scan(r, change(r.load(), np.random.default_rng(100 + i)))
+        replace_scan(r, change(r.load(), np.random.default_rng(100 + i)))
         for i, r in enumerate(map(make_scan, range(count)))
     ]
 
 
 @cache
-def street():
+def measure_street():
     return measure_scans(map(make_scan, range(SCANS)), PAPER)
 
 
@@ -106,7 +106,7 @@ def list_judged_bins(content: dict, names=CURVES) -> list[dict]:
 
 
 def test_recording_compared_with_itself_agrees():
-    content = compare_scans(street(), street())
+    content = compare_scans(measure_street(), measure_street())
     assert content["within"] == content["judged"] == len(list_judged_bins(content)) > 100
     assert all(b["ratio"] == 1.0 and compute_factor(b) == 1.0 for b in list_judged_bins(content))
     assert all(content["curves"][name]["judged"] for name in CURVES if name not in FACES)
@@ -120,14 +120,14 @@ def test_ground_is_found_below_a_low_sensor():
         lower.append(Frame.of(frame.name, replace(scan, xyz=scan.xyz + up), sensor_height=0.7))
     measured = measure_scans(lower, PAPER)
     for curve in ("clusters", "person clusters"):
-        np.testing.assert_array_equal(measured.rows[curve], street().rows[curve])
+        np.testing.assert_array_equal(measured.rows[curve], measure_street().rows[curve])
 
 
 def test_removing_points_changes_counts_and_not_sizes():
     def half(frame, rng):
         return frame.take(np.flatnonzero(rng.random(len(frame)) < 0.5))
 
-    content = compare_scans(street(), measure_scans(change_scans(half), PAPER))
+    content = compare_scans(measure_street(), measure_scans(change_scans(half), PAPER))
     for name in COUNTS:
         bins = [b for b in list_judged_bins(content, [name]) if b["real"]["median"] >= 100]
         assert all(b["ratio"] == pytest.approx(0.5, abs=0.1) for b in bins), name
@@ -138,7 +138,8 @@ def test_removing_points_changes_counts_and_not_sizes():
 
 def test_halving_the_intensity_changes_intensities_only():
     content = compare_scans(
-        street(), measure_scans(change_scans(lambda frame, rng: replace(frame, intensity=frame.intensity * 0.5)), PAPER)
+        measure_street(),
+        measure_scans(change_scans(lambda frame, rng: replace(frame, intensity=frame.intensity * 0.5)), PAPER),
     )
     for name, curve in content["curves"].items():
         if name not in LIGHT:
@@ -149,7 +150,7 @@ def test_halving_the_intensity_changes_intensities_only():
 
 def test_order_of_points_does_not_matter():
     content = compare_scans(
-        street(), measure_scans(change_scans(lambda frame, rng: frame.take(rng.permutation(len(frame)))), PAPER)
+        measure_street(), measure_scans(change_scans(lambda frame, rng: frame.take(rng.permutation(len(frame)))), PAPER)
     )
     for name, curve in content["curves"].items():
         for b in curve["bins"]:
@@ -168,7 +169,7 @@ def test_counts_add_up():
 
 
 def test_bins_of_few_real_samples_are_excluded():
-    content = compare_scans(measure_scans(map(make_scan, range(MIN_SAMPLES - 1)), PAPER), street())
+    content = compare_scans(measure_scans(map(make_scan, range(MIN_SAMPLES - 1)), PAPER), measure_street())
     assert all(content["curves"][name]["judged"] == 0 for name in (*COUNTS, *EXTENTS))
     for name, curve in content["curves"].items():
         for b in curve["bins"]:
@@ -176,9 +177,9 @@ def test_bins_of_few_real_samples_are_excluded():
 
 
 def test_missing_simulated_samples_count_as_a_difference():
-    content = compare_scans(street(), measure_scans([], PAPER))
+    content = compare_scans(measure_street(), measure_scans([], PAPER))
     assert content["within"] == 0
-    assert content["judged"] == compare_scans(street(), street())["judged"]
+    assert content["judged"] == compare_scans(measure_street(), measure_street())["judged"]
 
 
 def test_empty_scans_are_excluded():
@@ -204,7 +205,7 @@ def test_scans_without_intensity_have_all_other_curves():
 def test_cropped_scan_contributes_only_its_objects():
     whole = make_scan(0)
     seen = np.flatnonzero(whole.camera().in_view(whole.load().xyz))
-    cropped = with_scan(whole, whole.load().take(seen))
+    cropped = replace_scan(whole, whole.load().take(seen))
     assert is_full_scan(whole.load()) and not is_full_scan(cropped.load())
     measured = measure_scans([cropped], PAPER)
     assert (measured.scans, measured.full_scans) == (1, 0)
@@ -285,7 +286,7 @@ def test_median_within_real_interval_is_plausible():
     def thin(shares):
         return measure_scans(
             [
-                with_scan(r, r.load().take(np.flatnonzero(np.random.default_rng(100).random(len(r.load())) < share)))
+                replace_scan(r, r.load().take(np.flatnonzero(np.random.default_rng(100).random(len(r.load())) < share)))
                 for r, share in zip(map(make_scan, range(SCANS)), shares)
             ],
             PAPER,
@@ -299,7 +300,7 @@ def test_median_within_real_interval_is_plausible():
 
 
 def test_comparison_survives_json_and_is_printed():
-    content = compare_scans(street(), measure_scans(map(make_scan, range(3)), PAPER))
+    content = compare_scans(measure_street(), measure_scans(map(make_scan, range(3)), PAPER))
     again = json.loads(json.dumps(content, allow_nan=False))
     assert again == content
     shown = StringIO()
@@ -308,13 +309,13 @@ def test_comparison_survives_json_and_is_printed():
 
 
 def tracking_folder(root):
-    write(root / "training/velodyne/0000/000003.bin", scene().tobytes())
-    write(root / "training/calib/0000.txt", calibration_text())
-    write(root / "training/label_02/0000.txt", f"3 7 {walker_label()}\n")
+    write_file(root / "training/velodyne/0000/000003.bin", make_scene().tobytes())
+    write_file(root / "training/calib/0000.txt", make_calibration_text())
+    write_file(root / "training/label_02/0000.txt", f"3 7 {make_walker_label()}\n")
     return root
 
 
-@pytest.mark.parametrize("make", [lambda root: object_folder(root, walker_label(), 1), tracking_folder])
+@pytest.mark.parametrize("make", [lambda root: write_object_folder(root, make_walker_label(), 1), tracking_folder])
 def test_object_and_tracking_folders_are_read(tmp_path, make):
     measured = measure_scans(select_frames(open_recording(make(tmp_path))), PAPER)
     assert measured.objects == {"Car": 0, "Pedestrian": 1, "Cyclist": 0}
@@ -322,7 +323,7 @@ def test_object_and_tracking_folders_are_read(tmp_path, make):
 
 
 def test_folders_without_labels_are_rejected(tmp_path):
-    object_folder(tmp_path)
+    write_object_folder(tmp_path)
     for label in tmp_path.rglob("label_2/*.txt"):
         label.unlink()
     with pytest.raises(InputError, match="no labels"):
@@ -330,19 +331,19 @@ def test_folders_without_labels_are_rejected(tmp_path):
 
 
 def test_broken_scans_are_skipped_and_counted(tmp_path):
-    scans = sorted(object_folder(tmp_path, walker_label(), 3).rglob("velodyne/*.bin"))
-    write(scans[1], b"cut")
+    scans = sorted(write_object_folder(tmp_path, make_walker_label(), 3).rglob("velodyne/*.bin"))
+    write_file(scans[1], b"cut")
     measured = measure_scans(select_frames(open_recording(tmp_path)), PAPER)
     assert measured.scans == 2 and len(measured.skipped) == 1
     assert compare_scans(measured, measured)["real"]["skipped"] == measured.skipped
     for scan in scans:
-        write(scan, b"cut")
+        write_file(scan, b"cut")
     with pytest.raises(InputError, match=r"cannot read any of the 3 scans: .*000000.bin"):
         measure_scans(select_frames(open_recording(tmp_path)), PAPER)
 
 
 def test_frames_of_large_folder_are_evenly_spaced(tmp_path):
-    recording = open_recording(object_folder(tmp_path, walker_label(), 1))
+    recording = open_recording(write_object_folder(tmp_path, make_walker_label(), 1))
     many = [replace(recording.frames[0], name=str(i)) for i in range(3 * MAX_SCANS)]
     chosen = select_frames(replace(recording, frames=many))
     numbers = [int(f.name) for f in chosen]
@@ -351,7 +352,7 @@ def test_frames_of_large_folder_are_evenly_spaced(tmp_path):
 
 
 def test_command_writes_json(tmp_path):
-    root, made = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "made"
+    root, made = write_object_folder(tmp_path / "kitti", make_walker_label(), 1), tmp_path / "made"
     result = CliRunner().invoke(
         command.realism, [str(root), "--frames", "1", "--json", str(made / "realism.json")], catch_exceptions=False
     )
@@ -362,7 +363,7 @@ def test_command_writes_json(tmp_path):
 
 
 def test_command_simulates_the_given_sensor(tmp_path):
-    root, found = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "realism.json"
+    root, found = write_object_folder(tmp_path / "kitti", make_walker_label(), 1), tmp_path / "realism.json"
     result = CliRunner().invoke(
         command.realism,
         [str(root), "--frames", "1", "--json", str(found), "--sensor", "generic:4,-12,0,2,10"],

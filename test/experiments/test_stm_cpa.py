@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from samples import DATA, crowd_folder
+from samples import DATA, write_crowd_folder
 
 from experiments.framework.experiment import Cell
 from experiments.framework.runner import run_experiment
@@ -52,7 +52,7 @@ DIGEST = DATA.parent / "papers" / "DIGEST.md"
 
 @pytest.fixture(scope="module")
 def kitti(tmp_path_factory):
-    return crowd_folder(tmp_path_factory.mktemp("kitti"), COUNT)
+    return write_crowd_folder(tmp_path_factory.mktemp("kitti"), COUNT)
 
 
 @pytest.fixture(scope="module")
@@ -61,23 +61,23 @@ def records(kitti, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def measured(records):
+def paper_records(records):
     return [record for record in records if "skipped" not in record]
 
 
 @pytest.fixture(scope="module")
-def refined(kitti):
+def refined_frames(kitti):
     """Labelled frame, segments, seed and candidates of each frame with pedestrians."""
     found = []
     for frame in open_recording(kitti).frames[:-1]:
         labelled = load_labelled_frame(frame)
         segmented = segment_cloud(labelled.cloud, labelled.camera, PAPER)
         seed = make_nearest_seed(segmented, labelled)
-        found.append((labelled, segmented, seed, refine(segmented, seed, PAPER)))
+        found.append((labelled, segmented, seed, refine_frame(segmented, seed, PAPER)))
     return found
 
 
-def refine(segmented, seed, params):
+def refine_frame(segmented, seed, params):
     return refine_clusters(segmented.xyz, segmented.cluster_ids, segmented.boxes, [seed], params)
 
 
@@ -89,15 +89,15 @@ def add_up(measured, *keys):
     return np.sum(values, axis=0)
 
 
-def untimed(record):
+def drop_times(record):
     return {key: value for key, value in record.items() if key != "ms"}
 
 
-def test_sample_frames_have_hits_and_misses(measured):
+def test_sample_frames_have_hits_and_misses(paper_records):
     for stage in STAGES:
-        counts = {k: add_up(measured, "stages", stage, k).sum() for k in ("tp", "fp", "fn")}
+        counts = {k: add_up(paper_records, "stages", stage, k).sum() for k in ("tp", "fp", "fn")}
         assert min(counts.values()) > 0 or (stage == "stage1" and counts["fn"] == 0)
-    assert (add_up(measured, "pedestrians")[:3] > 0).all()
+    assert (add_up(paper_records, "pedestrians")[:3] > 0).all()
 
 
 def test_frames_are_in_order_and_empty_one_is_skipped(kitti, records):
@@ -106,8 +106,8 @@ def test_frames_are_in_order_and_empty_one_is_skipped(kitti, records):
     assert "no Pedestrian" in records[-1]["skipped"]
 
 
-def test_hits_and_misses_add_up_to_labels(kitti, measured):
-    for frame, record in zip(open_recording(kitti).frames, measured):
+def test_hits_and_misses_add_up_to_labels(kitti, paper_records):
+    for frame, record in zip(open_recording(kitti).frames, paper_records):
         truth = load_labelled_frame(frame).pedestrians
         assert record["pedestrians"] == np.bincount(find_range_bins(truth), minlength=5).tolist()
         for counts in (*record["stages"].values(), *record["cpa"]):
@@ -121,17 +121,17 @@ def test_hits_and_misses_add_up_to_labels(kitti, measured):
             assert (np.array(tp) <= record["pedestrians"]).all()
 
 
-def test_stages_agree_with_evaluate_candidates(kitti, measured):
+def test_stages_agree_with_evaluate_candidates(kitti, paper_records):
     report = CandidateReport()
     fill_report(report, open_recording(kitti), partial(measure_candidates, PAPER))
-    assert report.frames == len(measured)
+    assert report.frames == len(paper_records)
     for stage, score in report.scores.items():
         for key in ("tp", "fp", "fn"):
-            assert add_up(measured, "stages", stage, key).tolist() == getattr(score, key).tolist()
-        np.testing.assert_allclose(add_up(measured, "stages", stage, "error"), score.error, atol=1e-4)
+            assert add_up(paper_records, "stages", stage, key).tolist() == getattr(score, key).tolist()
+        np.testing.assert_allclose(add_up(paper_records, "stages", stage, "error"), score.error, atol=1e-4)
 
 
-def lower_sensor(frame, height):
+def lower_the_sensor(frame, height):
     """Return the frame as seen by a sensor at another height, metres."""
     up = np.array([0, 0, SENSOR_HEIGHT - height], np.float32)
     scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
@@ -147,7 +147,7 @@ def lower_sensor(frame, height):
 
 
 def test_low_sensor_agrees_with_evaluate_candidates(kitti):
-    frames = [lower_sensor(frame, 0.7) for frame in open_recording(kitti).frames[:2]]
+    frames = [lower_the_sensor(frame, 0.7) for frame in open_recording(kitti).frames[:2]]
     params, report = with_values(PAPER, {"ground.sensor_pose.height": 0.7}), CandidateReport()
     for frame in frames:
         report.update(score_frame(frame, params))
@@ -158,45 +158,45 @@ def test_low_sensor_agrees_with_evaluate_candidates(kitti):
             assert add_up(records, "stages", stage, key).tolist() == getattr(score, key).tolist()
 
 
-def test_zero_cpa_steps_equal_stage_2(measured):
-    for record in measured:
+def test_zero_cpa_steps_equal_stage_2(paper_records):
+    for record in paper_records:
         assert record["cpa"][0] == record["stages"]["stage2"]
         assert len(record["cpa"]) == NUMBERS.cpa_steps + 1
     for k in range(1, NUMBERS.cpa_steps + 1):
-        assert add_up(measured, "cpa", k, "tp")[0] == add_up(measured, "cpa", 0, "tp")[0]
-    without, much = (add_up(measured, "cpa", k, "tp") for k in (0, NUMBERS.cpa_steps))
+        assert add_up(paper_records, "cpa", k, "tp")[0] == add_up(paper_records, "cpa", 0, "tp")[0]
+    without, much = (add_up(paper_records, "cpa", k, "tp") for k in (0, NUMBERS.cpa_steps))
     assert much[2] > without[2]  # includes pedestrians beyond the 30 m of the final stage
 
 
-def test_two_cpa_steps_equal_final_stage_at_15_to_30_m(refined):
+def test_two_cpa_steps_equal_final_stage_at_15_to_30_m(refined_frames):
     compared = 0
-    for _, segmented, seed, found in refined:
-        sweep = refine(segmented, seed, extend_cpa(2)).final.boxes
+    for _, segmented, seed, found in refined_frames:
+        sweep = refine_frame(segmented, seed, extend_cpa(2)).final.boxes
         inside = [boxes[find_range_bins(boxes) == 1] for boxes in (sweep, found.final.boxes)]
         np.testing.assert_array_equal(*inside)
         compared += len(inside[0])
     assert compared > 3
 
 
-def test_readings_and_detector_count_the_same_pedestrians(measured):
-    for record in measured:
+def test_readings_and_detector_count_the_same_pedestrians(paper_records):
+    for record in paper_records:
         assert record["readings"]["window stretched, yaw"] == record["stages"]["final"]
         for counts in (*record["readings"].values(), record["pointpillars"]):
             assert np.add(counts["tp"], counts["fn"]).tolist() == record["pedestrians"]
-    totals = [add_up(measured, "readings", name, "fp").sum() for name in READINGS]
+    totals = [add_up(paper_records, "readings", name, "fp").sum() for name in READINGS]
     assert len(set(totals)) > 1  # the readings differ
-    tables = {t.name: t for s in STM_CPA.make_sections(measured) for t in s.tables}
+    tables = {t.name: t for s in STM_CPA.make_sections(paper_records) for t in s.tables}
     assert [row[0] for row in tables["readings"].rows] == [*READINGS]
     ours = next(row for row in tables["table_7"].rows if row[0] == "PointPillars V0, ours")
-    tp, fp, fn = (add_up(measured, "pointpillars", k).sum() for k in ("tp", "fp", "fn"))
+    tp, fp, fn = (add_up(paper_records, "pointpillars", k).sum() for k in ("tp", "fp", "fn"))
     assert ours[-3:] == (str(tp), str(fp), str(fn)) and ours[3].paper == 52.0
 
 
-def test_search_at_paper_setting_equals_stage_1(refined, measured):
+def test_search_at_paper_setting_equals_stage_1(refined_frames, paper_records):
     """Only ranges without boxes or pedestrians near their limits are compared, because clusters are split
     there."""
     compared = 0
-    for (labelled, _, _, found), record in zip(refined, measured):
+    for (labelled, _, _, found), record in zip(refined_frames, paper_records):
         boxes, truth = found.stage1.boxes, labelled.pedestrians
         pairs = match_centres(boxes, truth, NUMBERS.search_distance)
         tp, fp, *_ = count_by_range(boxes, truth, pairs)
@@ -215,8 +215,8 @@ def test_search_at_paper_setting_equals_stage_1(refined, measured):
 
 
 @pytest.mark.parametrize("moved, hits", [(0.3, True), (0.7, False)])
-def test_search_counts_only_closer_hits(refined, moved, hits):
-    labelled, segmented, seed, _ = refined[0]
+def test_search_counts_only_closer_hits(refined_frames, moved, hits):
+    labelled, segmented, seed, _ = refined_frames[0]
     counts = search_clustering(segmented, seed, labelled.pedestrians + [0, 0, moved, 0, 0, 0, 0])
     assert (np.sum(counts, axis=(0, 2))[0] > 0) == hits
 
@@ -274,24 +274,24 @@ def test_frame_with_a_bad_seed_has_misses_and_a_reason(kitti, tmp_path, change, 
     assert row == ("000002", "4", record["no_seed"])
 
 
-def test_record_does_not_depend_on_earlier_frames(kitti, measured):
+def test_record_does_not_depend_on_earlier_frames(kitti, paper_records):
     frames = open_recording(kitti).frames
     for number in (3, 1):
-        assert untimed(measure_frame(frames, number)) == untimed(measured[number])
+        assert drop_times(measure_frame(frames, number)) == drop_times(paper_records[number])
 
 
-def test_tables_agree_with_records(measured):
-    tables = {t.name: t for s in STM_CPA.make_sections(measured) for t in s.tables}
+def test_tables_agree_with_records(paper_records):
+    tables = {t.name: t for s in STM_CPA.make_sections(paper_records) for t in s.tables}
     for row, stage in zip(tables["table_3_6"].rows, STAGES, strict=True):
-        tp, fp, fn = (add_up(measured, "stages", stage, k).sum() for k in ("tp", "fp", "fn"))
+        tp, fp, fn = (add_up(paper_records, "stages", stage, k).sum() for k in ("tp", "fp", "fn"))
         _, recall, precision, f1, kept, error, *counts = row
         assert counts == [str(tp), str(fp), str(fn)]
         assert recall.value == pytest.approx(100 * tp / (tp + fn))
         assert precision.value == pytest.approx(100 * tp / (tp + fp))
         assert f1.value == pytest.approx(200 * tp / (2 * tp + fp + fn))
-        before = add_up(measured, "stages", "stage1", "tp").sum()
-        assert kept.value == pytest.approx(100 * add_up(measured, "stages", stage, "kept").sum() / before)
-        assert error.value == pytest.approx(add_up(measured, "stages", stage, "error").sum() / tp)
+        before = add_up(paper_records, "stages", "stage1", "tp").sum()
+        assert kept.value == pytest.approx(100 * add_up(paper_records, "stages", stage, "kept").sum() / before)
+        assert error.value == pytest.approx(add_up(paper_records, "stages", stage, "error").sum() / tp)
         assert [c.paper for c in (recall, precision, f1, kept, error)] == [*PAPER_TABLE_6[stage]]
         for cell in (recall, precision, f1):
             assert cell.low <= cell.value <= cell.high
@@ -300,7 +300,7 @@ def test_tables_agree_with_records(measured):
     steps = [cell.value for name, cell in final.items() if "total" not in name]
     assert final["total [ms]"].value == pytest.approx(sum(steps))
     assert sum(steps) == pytest.approx(
-        np.mean([sum(r["ms"].values()) - r["ms"]["stm_all"] - r["ms"]["confidence"] for r in measured])
+        np.mean([sum(r["ms"].values()) - r["ms"]["stm_all"] - r["ms"]["confidence"] for r in paper_records])
     )
     assert len(tables["table_5"].rows) == 9 and len(tables["table_4"].rows) == 15
 

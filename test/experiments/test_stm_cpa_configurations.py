@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import crowd_folder
+from samples import write_crowd_folder
 
 from experiments.stm_cpa import experiment
 from experiments.stm_cpa.configurations import (
@@ -24,7 +24,7 @@ COUNT = 4
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory):
-    return open_recording(crowd_folder(tmp_path_factory.mktemp("kitti"), COUNT)).frames
+    return open_recording(write_crowd_folder(tmp_path_factory.mktemp("kitti"), COUNT)).frames
 
 
 @pytest.fixture(scope="module")
@@ -60,13 +60,13 @@ def test_report_is_complete_with_and_without_records(records):
             assert all(len(row) == len(table.header) for row in table.rows), table.name
 
 
-def boxes_at(places):
+def make_boxes_at(places):
     return np.array([[x, y, -0.9, 0.6, 0.6, 1.7, 0] for x, y in places]).reshape(-1, 7)
 
 
 def test_seed_pedestrian_is_not_counted():
-    truth = boxes_at([(5, 0), (12, 3)])
-    found = ScoredBoxes(boxes_at([(5.1, 0), (20, 0)]), np.array([0.9, 0.8]), 0.5)
+    truth = make_boxes_at([(5, 0), (12, 3)])
+    found = ScoredBoxes(make_boxes_at([(5.1, 0), (20, 0)]), np.array([0.9, 0.8]), 0.5)
     counts = score_boxes(found, truth)
     assert [sum(counts[k]) for k in ("tp", "fp", "fn")] == [1, 1, 1]
     without = score_boxes(*drop_seed_pedestrian(found, truth, truth[0]))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from samples import object_folder, walker_label, write
+from samples import make_walker_label, write_file, write_object_folder
 
 from experiments.__main__ import cli
 from experiments.framework import command, trained_models
@@ -130,11 +130,11 @@ def run(*arguments):
 
 
 @pytest.fixture
-def listed(monkeypatch):
+def listed_models(monkeypatch):
     monkeypatch.setitem(command.EXPERIMENTS, "trained", f"{__name__}:TRAINED")
 
 
-def test_command_trains_and_measures_on_other_scans(tmp_path, listed):
+def test_command_trains_and_measures_on_other_scans(tmp_path, listed_models):
     result = run("sim", "--out", tmp_path / "out", "--limit", 2)
     assert result.exit_code == 0, result.output
     assert "v0 half seed 0" in (tmp_path / "out/report.md").read_text()
@@ -145,14 +145,14 @@ def test_command_trains_and_measures_on_other_scans(tmp_path, listed):
     assert len([*(tmp_path / "out/models").glob("*/")]) == 2
 
 
-def test_frames_of_a_recording_are_used_once(tmp_path, listed):
-    folder = object_folder(tmp_path / "kitti", walker_label(), count=6)
+def test_frames_of_a_recording_are_used_once(tmp_path, listed_models):
+    folder = write_object_folder(tmp_path / "kitti", make_walker_label(), count=6)
     scenes = ExperimentScenes.split(str(folder))
     used = [*scenes.train, *scenes.val, *scenes.test]
     assert sorted(used) == [f"{i:06}" for i in range(6)]
     assert [len(scenes.select_labelled(share)) for share in (1.0, 0.5, 0.01)] == [4, 2, 1]
     assert {*scenes.select_labelled(0.5)} < {*scenes.train}
-    chosen = ExperimentScenes.split(str(folder), write(tmp_path / "test.txt", "000001\n000003\n"))
+    chosen = ExperimentScenes.split(str(folder), write_file(tmp_path / "test.txt", "000001\n000003\n"))
     assert chosen.test == ("000001", "000003")
     result = run(folder, "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output

@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from detection_samples import lively, tiny
+from detection_samples import make_random_network, make_tiny_config
 
 from fuzz import files, messages, mutation, parameters
 from fuzz.case import FAILED, REFUSED, SURVIVED, Case, Outcome, read_memory_mb, run_cases
@@ -36,10 +36,10 @@ def nodes(domain, tmp_path_factory):
     """Return every node by its name, with small networks."""
     context, folder = create_context(domain), tmp_path_factory.mktemp("weights")
     pillars, clusters = str(folder / "v4.safetensors"), str(folder / "pointnet.safetensors")
-    config = tiny("v4", low=(0.0, -10.24, -3.0), high=(20.48, 10.24, 1.0))
-    save_checkpoint(pillars, lively(config), Header(config))
-    config = pointnet_samples.small()
-    save_checkpoint(clusters, pointnet_samples.lively(config), Header(config))
+    config = make_tiny_config("v4", low=(0.0, -10.24, -3.0), high=(20.48, 10.24, 1.0))
+    save_checkpoint(pillars, make_random_network(config), Header(config))
+    config = pointnet_samples.make_small_config()
+    save_checkpoint(clusters, pointnet_samples.make_random_network(config), Header(config))
     values = {
         "pointpillars_detector": {"pointpillars.weights": pillars},
         "pointnet_detector": {"pointnet.weights": clusters},

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from ground_samples import f1, street
+from ground_samples import compute_f1, make_street
 from hypothesis import given
 from hypothesis import strategies as st
 from samples import DATA, needs_data
@@ -29,7 +29,7 @@ def make_obstacles(seed, rows=24, columns=40):
     return heights
 
 
-def free_height(sheet, obstacle, lift):
+def compute_free_height(sheet, obstacle, lift):
     """Return the height that each cell would have without its obstacle."""
     wide = np.pad(sheet.astype(np.float64), 1, mode="edge")
     mean = (wide[:-2, 1:-1] + wide[2:, 1:-1] + wide[1:-1, :-2] + wide[1:-1, 2:]) / 4
@@ -40,7 +40,7 @@ def settle_slowly(obstacle, lift, steps=20_000):
     """Settle the sheet from below by projected Jacobi steps in float64."""
     sheet = np.full(obstacle.shape, obstacle.min(), np.float64)
     for _ in range(steps):
-        sheet = np.minimum(free_height(sheet, obstacle, lift), obstacle)
+        sheet = np.minimum(compute_free_height(sheet, obstacle, lift), obstacle)
     return sheet
 
 
@@ -48,7 +48,7 @@ def settle_slowly(obstacle, lift, steps=20_000):
 def test_each_cell_rests_on_an_obstacle_or_hangs_free(seed, lift, levels):
     obstacle = make_obstacles(seed)
     sheet = settle_sheet(obstacle, lift, 1e-5, levels)
-    free = free_height(sheet, obstacle, lift)
+    free = compute_free_height(sheet, obstacle, lift)
     touches = sheet >= obstacle - 1e-6
     assert (sheet <= obstacle).all()
     np.testing.assert_allclose(sheet[~touches], free[~touches], atol=2e-4)
@@ -63,7 +63,7 @@ def test_multigrid_equals_slow_relaxation(seed, lift):
         np.testing.assert_allclose(settle_sheet(obstacle, lift, 1e-6, levels), expected, atol=1e-3)
 
 
-def climbing_road(seed=0):
+def make_climbing_road(seed=0):
     """Return a road that rises by 0.9 m between 18 and 40 m, with three cars, and its mask.
 
     The road is sampled in rings, and the cars hide the road under them.
@@ -87,7 +87,7 @@ def climbing_road(seed=0):
 
 
 def test_climbing_road_is_ground_and_cars_on_it_are_not():
-    xyz, road = climbing_road()
+    xyz, road = make_climbing_road()
     result = segment_by_cloth(xyz)
     assert result[road].mean() > 0.97 and result[~road].mean() < 0.1
     # The same holds where reflections far below the road pull the cloth down.
@@ -139,8 +139,8 @@ def test_raising_an_obstacle_never_lowers_the_cloth(seed):
 
 @pytest.mark.parametrize("slope", [(0, 0), (0.1, -0.05), (-0.2, 0.15)])
 def test_sloped_road_is_ground_and_objects_are_not(slope):
-    xyz, road = street(slope=slope)
-    assert f1(segment_by_cloth(xyz), road) > 0.985
+    xyz, road = make_street(slope=slope)
+    assert compute_f1(segment_by_cloth(xyz), road) > 0.985
 
 
 def test_hill_too_curved_for_a_plane_is_ground():
@@ -154,14 +154,14 @@ def test_hill_too_curved_for_a_plane_is_ground():
 
 @given(st.integers(0, 2**31))
 def test_permuting_points_permutes_the_ground(seed):
-    xyz, _ = street(seed, count=4000)
+    xyz, _ = make_street(seed, count=4000)
     order = np.random.default_rng(seed).permutation(len(xyz))
     np.testing.assert_array_equal(segment_by_cloth(xyz[order]), segment_by_cloth(xyz)[order])
 
 
 @pytest.mark.parametrize("degrees, same", [(90, 0.999), (180, 0.999), (23, 0.99), (-71, 0.99)])
 def test_rotating_about_z_rotates_the_ground(degrees, same):
-    xyz, _ = street(3, slope=(0.05, 0.02))
+    xyz, _ = make_street(3, slope=(0.05, 0.02))
     angle = np.radians(degrees)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     turned = (xyz @ turn.T).astype(np.float32)
@@ -170,13 +170,13 @@ def test_rotating_about_z_rotates_the_ground(degrees, same):
 
 @pytest.mark.parametrize("far", [[1e5, 0, 0], [0, -9e4, 50], [0, 101, -1.7], [95, 80, 30], [-99, 3, -8]])
 def test_far_outlier_does_not_change_the_ground(far):
-    xyz, _ = street(4)
+    xyz, _ = make_street(4)
     result = segment_by_cloth(np.concatenate([xyz, np.float32([far])]))[:-1]
     assert (result != segment_by_cloth(xyz)).mean() < 1e-3
 
 
 def test_reflections_below_the_ground_do_not_lower_it():
-    xyz, _ = street(5)
+    xyz, _ = make_street(5)
     below = np.column_stack([np.random.default_rng(0).uniform(-30, 30, (40, 2)), np.full(40, -4.0)]).astype(np.float32)
     result = segment_by_cloth(np.concatenate([xyz, below]))
     assert not result[-40:].any()
@@ -184,11 +184,11 @@ def test_reflections_below_the_ground_do_not_lower_it():
 
 
 def test_points_beyond_max_range_are_ignored():
-    xyz, road = street(6)
+    xyz, road = make_street(6)
     params = ClothParams(max_range=15)
     inside = (np.abs(xyz[:, :2]) <= 15).all(axis=1)
     result = segment_by_cloth(xyz, params)
-    assert not result[~inside].any() and f1(result, road & inside) > 0.99
+    assert not result[~inside].any() and compute_f1(result, road & inside) > 0.99
     cells = 2**5
     assert lay_cloth(xyz, params).height.size <= (2 * 15 / 0.5 + 2 * cells) ** 2
 
@@ -210,9 +210,9 @@ def test_clouds_of_few_points_are_segmented(xyz, expected):
 
 
 def test_ground_hardly_depends_on_cloth_resolution():
-    xyz, road = street(7, count=120_000)
+    xyz, road = make_street(7, count=120_000)
     for resolution in (0.3, 0.5, 1.0):
-        assert f1(segment_by_cloth(xyz, ClothParams(resolution=resolution)), road) > 0.985
+        assert compute_f1(segment_by_cloth(xyz, ClothParams(resolution=resolution)), road) > 0.985
 
 
 @needs_data

@@ -16,7 +16,7 @@ def make_cloud(rng, count):
     return rng.uniform(-20.0, 20.0, (count, 3)).astype(np.float32)
 
 
-def plain_heights(xyz, ground):
+def compute_heights_slowly(xyz, ground):
     """Yield each point's height above every one of the equally near cells, point by point."""
     cells: dict[tuple, list] = {}
     for x, y, z in ground.astype(float):
@@ -34,7 +34,9 @@ def test_height_is_above_the_nearest_cell_with_ground(seed, count, reach):
     xyz, ground = make_cloud(rng, 50), make_cloud(rng, count)
     far = np.float32([reach, -reach, 0])
     for result, heights in zip(
-        compute_height_above_ground(xyz + far, ground + far), plain_heights(xyz + far, ground + far), strict=True
+        compute_height_above_ground(xyz + far, ground + far),
+        compute_heights_slowly(xyz + far, ground + far),
+        strict=True,
     ):
         assert np.abs(heights - result).min() <= 1e-9
 

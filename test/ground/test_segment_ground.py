@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from ground_samples import f1, street
+from ground_samples import compute_f1, make_street
 from samples import DATA, needs_data
 
 from lidar_perception.data.open import open_recording
@@ -16,7 +16,7 @@ from lidar_perception.types import PointCloud
 each_method = pytest.mark.parametrize("method", GROUND_METHODS)
 
 
-def segment(xyz, method, intensity=None, **params):
+def segment_xyz(xyz, method, intensity=None, **params):
     return segment_ground(PointCloud(np.asarray(xyz, np.float32), intensity), GroundParams(method=method, **params))
 
 
@@ -26,9 +26,9 @@ def test_every_method_name_has_a_function():
 
 @each_method
 def test_flat_road_is_ground_and_objects_are_not(method):
-    xyz, road = street()
+    xyz, road = make_street()
     beyond = np.hypot(xyz[:, 0], xyz[:, 1]) > 3  # Patchwork++ ignores nearer points
-    assert f1(segment(xyz, method)[beyond], road[beyond]) > 0.97
+    assert compute_f1(segment_xyz(xyz, method)[beyond], road[beyond]) > 0.97
 
 
 BAD = {
@@ -50,7 +50,7 @@ BAD = {
 def test_mask_has_the_length_of_any_invalid_cloud(method, name):
     xyz = np.asarray(BAD[name], np.float32)
     for intensity in (None, np.zeros(len(xyz), np.float32)):
-        result = segment(xyz, method, intensity)
+        result = segment_xyz(xyz, method, intensity)
         assert result.dtype == bool and result.shape == (len(xyz),)
     if name in ("origin", "all NaN", "all infinite"):
         assert not result.any()
@@ -58,42 +58,42 @@ def test_mask_has_the_length_of_any_invalid_cloud(method, name):
 
 @each_method
 def test_unusable_points_do_not_affect_the_others(method):
-    xyz, _ = street(1)
+    xyz, _ = make_street(1)
     rng = np.random.default_rng(0)
     bad = np.float32([[np.nan] * 3, [np.inf, 0, 0], [0, 0, 0], [2e5, 0, -1], [1, np.nan, -2]])
     at = np.sort(rng.integers(0, len(xyz), 500))
     mixed = np.insert(xyz, at, bad[rng.integers(0, 5, 500)], axis=0)
     is_bad = np.insert(np.zeros(len(xyz), bool), at, True)
     intensity = rng.random(len(mixed)).astype(np.float32)
-    result = segment(mixed, method, intensity)
+    result = segment_xyz(mixed, method, intensity)
     assert not result[is_bad].any()
-    np.testing.assert_array_equal(result[~is_bad], segment(xyz, method, intensity[~is_bad]))
+    np.testing.assert_array_equal(result[~is_bad], segment_xyz(xyz, method, intensity[~is_bad]))
 
 
 @each_method
 def test_million_points_are_segmented(method):
-    xyz, road = street(2, count=1_000_000)
-    assert f1(segment(xyz, method), road) > 0.95
+    xyz, road = make_street(2, count=1_000_000)
+    assert compute_f1(segment_xyz(xyz, method), road) > 0.95
 
 
 @each_method
 @pytest.mark.parametrize("height", [0.6, 2.5])
 def test_each_method_uses_the_sensor_height(method, height):
-    xyz, road = street(3)
+    xyz, road = make_street(3)
     xyz[:, 2] += np.float32(1.73 - height)
-    assert f1(segment(xyz, method, sensor_pose=SensorPoseParams(height=height)), road) > 0.97
+    assert compute_f1(segment_xyz(xyz, method, sensor_pose=SensorPoseParams(height=height)), road) > 0.97
 
 
 @each_method
 @pytest.mark.parametrize("roll, pitch", [(0.05, 0.0), (0.0, 0.2), (-0.1, 0.3), (np.pi, 0.0), (np.pi, -0.1)])
 def test_tilted_and_level_sensor_give_equal_ground(method, roll, pitch):
-    xyz, _ = street(4)
+    xyz, _ = make_street(4)
     pose = SensorPoseParams(roll=float(np.float32(roll)), pitch=pitch)
     axes = level_points(np.eye(3, dtype=np.float32), pose)  # rows: the levelled axes
     tilted = xyz @ axes.T
     np.testing.assert_allclose(level_points(tilted, pose), xyz, atol=1e-4)
-    result = segment(tilted, method, sensor_pose=pose)
-    assert (result == segment(xyz, method)).mean() > 0.995
+    result = segment_xyz(tilted, method, sensor_pose=pose)
+    assert (result == segment_xyz(xyz, method)).mean() > 0.995
 
 
 def test_pitch_and_roll_rotate_as_in_a_urdf():
@@ -117,7 +117,7 @@ def run_library(xyz, intensity, height=1.73, rnr=True):
     return result
 
 
-def hilly_scene(seed):
+def make_hilly_scene(seed):
     """Return points (N, 3) on slopes, raised plates, walls and reflections below the ground, and their intensity
     (N,). The scene contains every case that Patchwork++ distinguishes."""
     rng = np.random.default_rng(seed)
@@ -137,7 +137,7 @@ def hilly_scene(seed):
 @pytest.mark.parametrize("rnr", [True, False])
 @pytest.mark.parametrize("seed", range(3))
 def test_patchwork_equals_the_library_up_to_rounding(seed, rnr):
-    xyz, intensity = hilly_scene(seed)
+    xyz, intensity = make_hilly_scene(seed)
     expected = run_library(xyz, intensity, rnr=rnr)
     result = segment_by_patchwork(xyz, intensity if rnr else None, 1.73)
     assert 0.2 < expected.mean() < 0.8
@@ -164,13 +164,13 @@ def test_patchwork_equals_the_library_on_a_real_scan():
 def test_permuting_points_of_a_real_scan_permutes_the_ground(method):
     frame = open_recording(DATA / "semantickitti").frames[0].load()
     order = np.random.default_rng(0).permutation(len(frame))
-    result = segment(frame.xyz, method)
-    assert (segment(frame.xyz[order], method) == result[order]).mean() > 0.99
+    result = segment_xyz(frame.xyz, method)
+    assert (segment_xyz(frame.xyz[order], method) == result[order]).mean() > 0.99
 
 
 @each_method
 def test_input_is_not_modified(method):
-    xyz, _ = street(6)
+    xyz, _ = make_street(6)
     before = xyz.copy()
-    segment(xyz, method, np.ones(len(xyz), np.float32), sensor_pose=SensorPoseParams(pitch=0.1))
+    segment_xyz(xyz, method, np.ones(len(xyz), np.float32), sensor_pose=SensorPoseParams(pitch=0.1))
     np.testing.assert_array_equal(xyz, before)

@@ -22,7 +22,7 @@ SCANS = DATA / "kitti_object/training/velodyne"
 slopes = st.floats(-0.15, 0.15)
 
 
-def sloped_scene(seed, plane, count=3000, outliers=0.4, noise=0.02, max_outlier=4.0):
+def make_sloped_scene(seed, plane, count=3000, outliers=0.4, noise=0.02, max_outlier=4.0):
     """Return noisy points of the plane within 20 m, and outliers up to max_outlier m above it."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-20, 20, (count, 2))
@@ -32,18 +32,18 @@ def sloped_scene(seed, plane, count=3000, outliers=0.4, noise=0.02, max_outlier=
     return np.column_stack([xy, z]).astype(np.float32)
 
 
-def angle_between(p, q):
+def compute_angle(p, q):
     """Return the angle between the normals of two planes, in degrees."""
     n, m = (np.array([-a[0], -a[1], 1.0]) for a in (p, q))
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(n, m)), n @ m))
 
 
-def max_distance(p, q, reach=20.0):
+def compute_max_distance(p, q, reach=20.0):
     """Return the largest distance along z of two planes for |x|, |y| <= reach."""
     return abs(p[2] - q[2]) + reach * (abs(p[0] - q[0]) + abs(p[1] - q[1]))
 
 
-def real_scans(*numbers):
+def load_real_scans(*numbers):
     for i in numbers:
         raw = np.fromfile(sorted(SCANS.glob("*.bin"))[i], np.float32).reshape(-1, 4)
         yield np.ascontiguousarray(raw[:, :3])
@@ -52,15 +52,15 @@ def real_scans(*numbers):
 @given(st.integers(0, 2**31), slopes, slopes, st.floats(-3, -1.3))
 def test_plane_is_accurate_with_40_percent_outliers(seed, a, b, c):
     true = np.array([a, b, c])
-    xyz = sloped_scene(seed, true)
+    xyz = make_sloped_scene(seed, true)
     result = fit_plane_by_ransac(xyz, ThresholdParams(max_height=100.0))
-    assert angle_between(result, true) < 0.1
+    assert compute_angle(result, true) < 0.1
     assert abs(result[2] - true[2]) < 0.01
 
 
 @given(st.integers(0, 2**31), slopes, slopes)
 def test_all_points_within_inlier_distance_are_ground(seed, a, b):
-    xyz = sloped_scene(seed, [a, b, -1.7])
+    xyz = make_sloped_scene(seed, [a, b, -1.7])
     params = ThresholdParams(max_height=0.73, inlier_distance=0.07)
     plane = find_plane(xyz, params, sensor_height=1.73)
     x, y, z = xyz.T.astype(np.float64)
@@ -71,7 +71,7 @@ def test_all_points_within_inlier_distance_are_ground(seed, a, b):
 
 @given(st.integers(0, 2**31), slopes, slopes, st.sampled_from([0.0, 300.0, 5000.0]))
 def test_fitting_the_ground_of_a_plane_keeps_the_plane(seed, a, b, offset):
-    xyz = sloped_scene(seed, [a, b, -1.7])
+    xyz = make_sloped_scene(seed, [a, b, -1.7])
     xyz[:, 0] += np.float32(offset)
     params = ThresholdParams(max_height=100.0)
     plane = fit_plane_by_ransac(xyz, params)
@@ -85,7 +85,7 @@ def test_fitting_the_ground_of_a_plane_keeps_the_plane(seed, a, b, offset):
 
 @given(st.integers(0, 2**31), slopes, slopes)
 def test_permuting_points_permutes_the_ground(seed, a, b):
-    xyz = sloped_scene(seed, [a, b, -1.7])
+    xyz = make_sloped_scene(seed, [a, b, -1.7])
     order = np.random.default_rng(seed).permutation(len(xyz))
     params = ThresholdParams(max_height=100.0)
     np.testing.assert_array_equal(segment_by_threshold(xyz[order], params), segment_by_threshold(xyz, params)[order])
@@ -93,7 +93,7 @@ def test_permuting_points_permutes_the_ground(seed, a, b):
 
 @given(st.integers(0, 2**31), slopes, slopes)
 def test_fit_plane_equals_numpy_least_squares(seed, a, b):
-    xyz = sloped_scene(seed, [a, b, -1.7], count=50).astype(np.float64)
+    xyz = make_sloped_scene(seed, [a, b, -1.7], count=50).astype(np.float64)
     design = np.column_stack([xyz[:, :2], np.ones(len(xyz))])
     np.testing.assert_allclose(fit_plane(xyz), np.linalg.lstsq(design, xyz[:, 2], rcond=None)[0], rtol=0, atol=1e-9)
 
@@ -101,7 +101,7 @@ def test_fit_plane_equals_numpy_least_squares(seed, a, b):
 @needs_data
 @pytest.mark.parametrize("scan", [0, 5, 13, 20])
 def test_plane_of_a_real_cloud_equals_sklearn_ransac(scan):
-    (xyz,) = real_scans(scan)
+    (xyz,) = load_real_scans(scan)
     params = ThresholdParams()
     low = xyz[xyz[:, 2] < -1.3]
     model = RANSACRegressor(
@@ -121,13 +121,13 @@ def test_plane_of_a_real_cloud_equals_sklearn_ransac(scan):
         if np.array_equal(plane, before):
             break
     result = fit_plane_by_ransac(low, params)
-    assert angle_between(result, plane) < 0.1
+    assert compute_angle(result, plane) < 0.1
     assert abs(result[2] - plane[2]) < 0.01
 
 
 @needs_data
 def test_plane_of_a_real_cloud_ignores_order_and_seed():
-    for xyz in real_scans(2, 9):
+    for xyz in load_real_scans(2, 9):
         params = ThresholdParams()
         ground = segment_by_threshold(xyz, params)
         plane = find_plane(xyz, params)
@@ -138,7 +138,7 @@ def test_plane_of_a_real_cloud_ignores_order_and_seed():
             segment_by_threshold(xyz[order], params)[np.argsort(order)],
         ):
             assert (other != ground).mean() < 0.01
-            assert max_distance(fit_plane(xyz[other]), plane) < 0.05
+            assert compute_max_distance(fit_plane(xyz[other]), plane) < 0.05
 
 
 def wall(count=400):
@@ -146,7 +146,7 @@ def wall(count=400):
     return np.column_stack([np.full(count, 5.0), rng.uniform(-8, 8, count), rng.uniform(-4, -1.4, count)])
 
 
-upside_down = sloped_scene(0, np.array([0.01, 0, -1.73]), max_outlier=2.5) * np.float32([1, -1, -1])
+upside_down = make_sloped_scene(0, np.array([0.01, 0, -1.73]), max_outlier=2.5) * np.float32([1, -1, -1])
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ upside_down = sloped_scene(0, np.array([0.01, 0, -1.73]), max_outlier=2.5) * np.
         np.linspace(1, 9, 65)[:, None] * [1, 2, 0] - [0, 0, 2],
         np.linspace(1, 9, 65)[:, None] * [0, 0, -1] - [4, 4, 2],
         wall(),
-        sloped_scene(0, [0, 0, 0.5]),
+        make_sloped_scene(0, [0, 0, 0.5]),
         upside_down,
     ],
     ids=[
@@ -195,14 +195,14 @@ def test_fit_plane_needs_three_points_not_on_a_line():
 
 
 def test_plane_steeper_than_max_slope_is_not_ground():
-    steep = sloped_scene(1, [np.tan(np.radians(20)), 0, -20], outliers=0, noise=0.0)
+    steep = make_sloped_scene(1, [np.tan(np.radians(20)), 0, -20], outliers=0, noise=0.0)
     assert segment_by_threshold(steep, ThresholdParams(max_slope=21.0, max_height=5.0)).mean() > 0.9
     assert not segment_by_threshold(steep, ThresholdParams(max_slope=5.0, max_height=5.0)).any()
 
 
 def test_ground_continues_where_the_road_rises_above_max_height():
     # A slope of 12 degrees is 4 m high at 20 m; a threshold on z would end after 2 m.
-    xyz = sloped_scene(2, [0.2, 0, -1.73], outliers=0.3)
+    xyz = make_sloped_scene(2, [0.2, 0, -1.73], outliers=0.3)
     on_plane = np.abs(compute_height_above_plane(xyz, np.array([0.2, 0, -1.73]))) < 0.05
     ground = segment_by_threshold(xyz)
     assert ground[on_plane].mean() > 0.99 and ground[xyz[:, 0] > 10].sum() > 400
@@ -223,7 +223,7 @@ def test_max_height_is_relative_to_the_ground_below_the_sensor():
 
 
 def test_result_is_repeatable_and_the_input_not_modified():
-    xyz = sloped_scene(3, [0.05, 0.02, -1.8])
+    xyz = make_sloped_scene(3, [0.05, 0.02, -1.8])
     before = xyz.copy()
     first = segment_by_threshold(xyz)
     np.testing.assert_array_equal(segment_by_threshold(xyz), first)
@@ -232,7 +232,7 @@ def test_result_is_repeatable_and_the_input_not_modified():
 
 @given(st.integers(0, 2**31), slopes, slopes)
 def test_height_threshold_removes_all_low_points(seed, a, b):
-    xyz = sloped_scene(seed, [a, b, -1.7])
+    xyz = make_sloped_scene(seed, [a, b, -1.7])
     np.testing.assert_array_equal(
         segment_by_threshold(xyz, ThresholdParams(separate="height")), xyz[:, 2] < np.float32(-1.3)
     )

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cli_samples import error_line, exit_of
-from format_samples import drive, make_labels
-from samples import object_folder, walker_truth
+from cli_samples import read_error_line, run_main
+from format_samples import make_format_drive, make_labels
+from samples import make_walker_truth, write_object_folder
 
 from lidar_perception.cli import convert
 from lidar_perception.data.to_bag import write_bag
@@ -96,15 +96,15 @@ INVALID = [  # format, text that is replaced, replacement, words of the error
 ]
 
 
-def text(content):
+def format_labels(content):
     return content if isinstance(content, str) else json.dumps(content)
 
 
 def write_labels(folder, format, old="", new=""):
     name, content = VALID[format]
     folder.mkdir(exist_ok=True)
-    assert old in text(content)
-    (folder / name).write_text(text(content).replace(old, new, 1))
+    assert old in format_labels(content)
+    (folder / name).write_text(format_labels(content).replace(old, new, 1))
     return folder / name if format == "nuscenes-detection" else folder
 
 
@@ -112,12 +112,12 @@ def write_labels(folder, format, old="", new=""):
 def test_unchanged_examples_are_valid(format, tmp_path):
     path = write_labels(tmp_path / "in", format)
     assert recognise_format(path) == format
-    assert import_labels(path, format, drive("one")).box_count == 1
+    assert import_labels(path, format, make_format_drive("one")).box_count == 1
 
 
 def test_kitti_folder_is_recognised_by_its_folders(tmp_path):
     """The first text file is a calibration."""
-    write_dataset("kitti-tracking", drive("one"), tmp_path / "set")
+    write_dataset("kitti-tracking", make_format_drive("one"), tmp_path / "set")
     for path in tmp_path / "set", tmp_path / "set/training":
         assert recognise_format(path) == "kitti-tracking"
     with pytest.raises(InputError, match="cannot recognise the label format"):
@@ -150,7 +150,7 @@ def test_other_json_files_are_not_recognised(content, tmp_path):
 def test_invalid_labels_are_reported_with_their_file(format, old, new, words, tmp_path):
     path = write_labels(tmp_path / "in", format, old, new)
     with pytest.raises(InputError) as error:
-        import_labels(path, format, drive("one"))
+        import_labels(path, format, make_format_drive("one"))
     assert words in str(error.value) and str(tmp_path / "in") in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -160,14 +160,14 @@ def test_unknown_or_missing_label_files_are_reported(format, tmp_path):
     path = write_labels(tmp_path / "in", format)
     suffix = VALID[format][0][-5:].lstrip("0123456789")
     stranger = path / f"000099{suffix}"
-    stranger.write_text(text(VALID[format][1]))
+    stranger.write_text(format_labels(VALID[format][1]))
     with pytest.raises(InputError, match="does not belong to a frame of the drive"):
-        import_labels(path, format, drive("one"))
+        import_labels(path, format, make_format_drive("one"))
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="has no label files"):
-        import_labels(tmp_path / "empty", format, drive("one"))
+        import_labels(tmp_path / "empty", format, make_format_drive("one"))
     with pytest.raises(InputError, match=r"does not exist|cannot read"):
-        import_labels(tmp_path / "none", format, drive("one"))
+        import_labels(tmp_path / "none", format, make_format_drive("one"))
 
 
 def test_convert_offers_all_formats_and_layouts():
@@ -190,7 +190,7 @@ def test_invalid_numbers_are_rejected():
 @pytest.mark.parametrize("format", FORMATS)
 @pytest.mark.parametrize("key", ["rotation", "tracking_id", "uid", "truncated", "openlabel_cuboid"])
 def test_fields_of_other_tools_are_kept_or_rejected(key, format, tmp_path):
-    frames = drive("one")
+    frames = make_format_drive("one")
     for value in None, "x", {}, [0] * 4, [10**400] * 4, [1, 0, 0, 0]:
         labels = DriveLabels(
             [
@@ -209,7 +209,7 @@ def test_fields_of_other_tools_are_kept_or_rejected(key, format, tmp_path):
 
 def test_huge_integers_survive_every_format(tmp_path):
     """The integers are in extra fields, which are only copied."""
-    frames = drive("one")
+    frames = make_format_drive("one")
     path = write_labels(tmp_path / "in", "labelcloud", '"name"', f'"n": {10**400}, "name"')
     labels = import_labels(path, "labelcloud", frames)
     for format in set(FORMATS) - {"kitti", "kitti-tracking"}:  # they have no extra fields
@@ -220,7 +220,7 @@ def test_huge_integers_survive_every_format(tmp_path):
 
 @pytest.mark.parametrize("format", FORMATS)
 def test_existing_labels_are_replaced_only_with_force(format, tmp_path):
-    frames = drive("one")
+    frames = make_format_drive("one")
     labels, other = (make_labels(frames, format, seed) for seed in (0, 1))
     export_labels(labels, format, tmp_path / "out", frames)
     with pytest.raises(InputError, match="already exists"):
@@ -231,7 +231,7 @@ def test_existing_labels_are_replaced_only_with_force(format, tmp_path):
 
 
 def test_force_keeps_other_files(tmp_path):
-    frames = drive("one")
+    frames = make_format_drive("one")
     export_labels(make_labels(frames, "sustech"), "sustech", tmp_path / "out", frames)
     (tmp_path / "out/notes.txt").write_text("mine")
     with pytest.raises(InputError, match=r"1 files that would not be replaced, such as notes.txt"):
@@ -250,7 +250,7 @@ def limit_file_size():
 
 @pytest.mark.parametrize("format", sorted(FORMATS.keys() - {"mcap", "mcap-labels"}))
 def test_full_disk_leaves_no_partial_labels(format, tmp_path, limit_file_size):
-    frames = drive("one")
+    frames = make_format_drive("one")
     export_labels(make_labels(frames, format), format, tmp_path / "old", frames)
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     for out, force in (("old", True), ("new", False)):
@@ -262,7 +262,7 @@ def test_full_disk_leaves_no_partial_labels(format, tmp_path, limit_file_size):
 
 
 def test_data_set_is_written_completely_or_not_at_all(tmp_path, limit_file_size):
-    frames = drive("one")
+    frames = make_format_drive("one")
     broken = replace(frames[2], load=lambda: (_ for _ in ()).throw(InputError("scan 2 is cut")))
     with pytest.raises(InputError, match="scan 2 is cut"):
         write_dataset("kitti", [*frames[:2], broken], tmp_path / "out")
@@ -275,7 +275,7 @@ def test_data_set_is_written_completely_or_not_at_all(tmp_path, limit_file_size)
 
 
 def test_missing_calibration_or_pose_is_reported(tmp_path):
-    bare = [replace(f, pose=lambda: None) for f in drive("one", camera=False)]
+    bare = [replace(f, pose=lambda: None) for f in make_format_drive("one", camera=False)]
     with pytest.raises(InputError, match="no camera calibration"):
         export_labels(make_labels(bare, "kitti"), "kitti", tmp_path / "k", bare)
     with pytest.raises(InputError, match="has no pose"):
@@ -315,10 +315,13 @@ def test_missing_calibration_or_pose_is_reported(tmp_path):
     ],
 )
 def test_convert_reports_errors_in_one_line(arguments, words, tmp_path, monkeypatch, capsys):
-    root = object_folder(tmp_path / "kitti")
-    write_bag(tmp_path / "bag", [replace(frame, pose=lambda: None, truth=walker_truth) for frame in drive("one")])
+    root = write_object_folder(tmp_path / "kitti")
+    write_bag(
+        tmp_path / "bag",
+        [replace(frame, pose=lambda: None, truth=make_walker_truth) for frame in make_format_drive("one")],
+    )
     (tmp_path / "empty").mkdir()
     places = {"bag": tmp_path / "bag", "out": tmp_path / "out", "kitti": root, "empty": tmp_path / "empty"}
-    assert exit_of(monkeypatch, "convert", *(a.format(**places) for a in arguments)) == 2
-    assert words in error_line(capsys)
+    assert run_main(monkeypatch, "convert", *(a.format(**places) for a in arguments)) == 2
+    assert words in read_error_line(capsys)
     assert not (tmp_path / "out").exists()

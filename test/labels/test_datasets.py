@@ -7,11 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cli_samples import error_line, exit_of
-from format_samples import CALIBRATION, drive, make_labels, pose, same
+from cli_samples import read_error_line, run_main
+from format_samples import CALIBRATION, assert_equal_labels, make_format_drive, make_labels, make_sloped_pose
 from marker_messages import make_detection_markers
 from nuscenes_folder import make_tables, save
-from robot_bags import ON_BASE, base_at, mount, moving, moving_tf, recorded, stamps
+from robot_bags import (
+    ON_BASE,
+    compute_base_pose,
+    list_stamps,
+    make_mount_rows,
+    make_odometry_rows,
+    make_tf_rows,
+    write_robot_bag,
+)
 from samples import DATA, needs_data
 
 from lidar_perception.classes import CAR
@@ -41,7 +49,7 @@ LAYOUTS = ("kitti", "kitti-tracking", "semantickitti")
 REAL = {"kitti_object": "kitti", "kitti_tracking": "kitti-tracking", "semantickitti": "semantickitti"}
 
 
-def same_frames(recording, others, boxes=1e-5, points=0.0):
+def assert_equal_frames(recording, others, boxes=1e-5, points=0.0):
     for frame, other in zip(recording, others, strict=True):
         scan, again = frame.load(), other.load()
         np.testing.assert_allclose(again.xyz, scan.xyz, atol=points)
@@ -63,18 +71,18 @@ def same_frames(recording, others, boxes=1e-5, points=0.0):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_simulated_data_set_survives_conversion(layout, made, tmp_path):
-    recording = open_recording(made / layout)
+def test_simulated_data_set_survives_conversion(layout, simulated_data_sets, tmp_path):
+    recording = open_recording(simulated_data_sets / layout)
     write_bag(tmp_path / "bag", recording)
     bag = open_recording(tmp_path / "bag")
     summary = write_dataset(layout, bag, tmp_path / "back")
     assert summary.frames == len(recording)
     back = open_recording(tmp_path / "back")
     assert (back.layout, back.contents) == (recording.layout, recording.contents)
-    same_frames(recording, back)
+    assert_equal_frames(recording, back)
     if layout != "semantickitti":  # label files are identical
-        for file in (made / layout).glob("training/label_*/*.txt"):
-            other = tmp_path / "back" / file.relative_to(made / layout)
+        for file in (simulated_data_sets / layout).glob("training/label_*/*.txt"):
+            other = tmp_path / "back" / file.relative_to(simulated_data_sets / layout)
             assert other.read_text().split() == file.read_text().split()
 
 
@@ -85,21 +93,21 @@ def test_real_data_set_survives_conversion(folder, tmp_path):
     recording = recording.select([frame.name for frame in recording.frames[:4]])
     write_bag(tmp_path / "bag", recording)
     write_dataset(REAL[folder], open_recording(tmp_path / "bag"), tmp_path / "back")
-    same_frames(recording, open_recording(tmp_path / "back"))
+    assert_equal_frames(recording, open_recording(tmp_path / "back"))
 
 
 @pytest.fixture(scope="module")
-def simulated(streets, tmp_path_factory):
+def simulated_bag(streets, tmp_path_factory):
     """Return the bag of a simulated drive."""
     path = tmp_path_factory.mktemp("bags") / "drive"
     write_bag(path, simulate_frames(5, 4, SMALL))
     return path
 
 
-def test_simulated_drive_survives_conversion_to_nuscenes(simulated, tmp_path):
-    summary = write_dataset("nuscenes", open_recording(simulated), tmp_path / "n")
+def test_simulated_drive_survives_conversion_to_nuscenes(simulated_bag, tmp_path):
+    summary = write_dataset("nuscenes", open_recording(simulated_bag), tmp_path / "n")
     assert all(remark.startswith("written as another class: ") for remark in summary.remarks)
-    recording, back = list(open_recording(simulated)), list(open_recording(tmp_path / "n"))
+    recording, back = list(open_recording(simulated_bag)), list(open_recording(tmp_path / "n"))
     assert sum(len(frame.truth()) for frame in recording) == summary.boxes > 0
     tracks = {}
     for frame, other in zip(recording, back, strict=True):
@@ -117,7 +125,7 @@ def test_simulated_drive_survives_conversion_to_nuscenes(simulated, tmp_path):
     assert len(set(tracks.values())) == len(tracks)
 
 
-def frames_at(seconds, **more):
+def make_frames_at(seconds, **more):
     return [
         Frame.of(
             str(i),
@@ -153,7 +161,7 @@ def test_labels_of_a_tilted_vehicle_survive_conversion(kind, tmp_path):
 
 def test_camera_is_assumed_and_frame_numbers_follow_time(tmp_path):
     """A missing scan leaves a gap in the numbers; after a longer gap a new drive starts."""
-    frames = frames_at([0, 0.1, 0.31, 0.4, 30, 30.07, 30.13], pose=np.eye(4).copy)
+    frames = make_frames_at([0, 0.1, 0.31, 0.4, 30, 30.07, 30.13], pose=np.eye(4).copy)
     labels = make_labels(frames, "kitti-tracking")
     summary = write_dataset("kitti-tracking", frames, tmp_path / "k", labels)
     assert (summary.frames, summary.drives) == (7, 2)
@@ -170,14 +178,14 @@ def test_camera_is_assumed_and_frame_numbers_follow_time(tmp_path):
     found = DriveLabels(
         [replace(read_frame_labels(frame), name=a.name, stamp_ns=a.stamp_ns) for a, frame in zip(frames, back)]
     )
-    same(labels, found, 2e-6)
+    assert_equal_labels(labels, found, 2e-6)
 
 
 @pytest.mark.parametrize("layout", REAL)
 @pytest.mark.parametrize("height", [0.62, SENSOR_HEIGHT, 2.9])
 def test_sensor_height_is_kept(tmp_path, layout, height):
     points = PointTruth(np.zeros(3, np.uint16), np.zeros(3, np.uint16))
-    frames = frames_at([0, 0.1], point_truth=lambda: points, sensor_height=height)
+    frames = make_frames_at([0, 0.1], point_truth=lambda: points, sensor_height=height)
     write_dataset(layout, frames, tmp_path / "folder")
     assert [f.sensor_height for f in open_recording(tmp_path / "folder")] == [height] * 2
     assert (tmp_path / "folder/mount.json").exists() == (height != SENSOR_HEIGHT)
@@ -186,21 +194,23 @@ def test_sensor_height_is_kept(tmp_path, layout, height):
 
 def test_point_labels_are_written_if_the_layout_has_them(tmp_path, monkeypatch, capsys):
     points = PointTruth(np.array([40, 252, 0], np.uint16), np.array([0, 7, 65535], np.uint16))
-    write_bag(tmp_path / "labelled", frames_at([0, 0.1], point_truth=lambda: points, calibration=CALIBRATION))
-    write_bag(tmp_path / "bare", frames_at([0, 0.1]))
-    assert exit_of(monkeypatch, "convert", tmp_path / "labelled", "--to", "semantickitti", "--out", tmp_path / "s") == 0
+    write_bag(tmp_path / "labelled", make_frames_at([0, 0.1], point_truth=lambda: points, calibration=CALIBRATION))
+    write_bag(tmp_path / "bare", make_frames_at([0, 0.1]))
+    assert (
+        run_main(monkeypatch, "convert", tmp_path / "labelled", "--to", "semantickitti", "--out", tmp_path / "s") == 0
+    )
     for frame in open_recording(tmp_path / "s"):
         assert frame.point_truth().instances.tolist() == [0, 7, 65535]
-    assert exit_of(monkeypatch, "convert", tmp_path / "labelled", "--to", "kitti", "--out", tmp_path / "k") == 0
+    assert run_main(monkeypatch, "convert", tmp_path / "labelled", "--to", "kitti", "--out", tmp_path / "k") == 0
     assert "left out: point labels" in capsys.readouterr().out
-    assert exit_of(monkeypatch, "convert", tmp_path / "bare", "--to", "semantickitti", "--out", tmp_path / "none") == 2
-    assert "has no point labels" in error_line(capsys)
+    assert run_main(monkeypatch, "convert", tmp_path / "bare", "--to", "semantickitti", "--out", tmp_path / "none") == 2
+    assert "has no point labels" in read_error_line(capsys)
     assert not (tmp_path / "none").exists() and not list(tmp_path.glob(".*"))
 
 
 def test_detections_on_a_topic_become_labels(tmp_path, monkeypatch):
     """The topic has a MarkerArray of the package's nodes or a Detection3DArray of any node, also of tracks."""
-    frames, rng = drive("one"), np.random.default_rng(2)
+    frames, rng = make_format_drive("one"), np.random.default_rng(2)
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/found", "visualization_msgs/msg/MarkerArray")
         bag.add_topic("/tracks", "vision_msgs/msg/Detection3DArray")
@@ -233,34 +243,36 @@ def test_detections_on_a_topic_become_labels(tmp_path, monkeypatch):
         assert other.class_names == ["tree"] * len(boxes)
 
 
-@pytest.mark.parametrize("parts", [[moving(ODOMETRY), mount()], [moving_tf(), mount()], []])
+@pytest.mark.parametrize(
+    "parts", [[make_odometry_rows(ODOMETRY), make_mount_rows()], [make_tf_rows(), make_mount_rows()], []]
+)
 def test_boxes_are_transformed_to_the_frame_of_the_clouds(parts, tmp_path):
     """Nodes with target_frame:=odom publish such boxes. Unconnected frames are reported."""
     boxes = np.array([[10.0, 2, 0.5, 4, 2, 1.5, 0.3]])
     rows = []
-    for stamp in stamps():
+    for stamp in list_stamps():
         marked = to_marker_array(
             boxes, ["Car"], ids=[1], make=make_bag_message, header=make_header(stamp, "odom", make_bag_message)
         )
         rows += [(topic, MARKERS, stamp, marked) for topic in ("/n/output/detections", "/n/output/tracks")]
-    recording = recorded(tmp_path / "bag", *map(list, parts), rows)
+    recording = write_robot_bag(tmp_path / "bag", *map(list, parts), rows)
     frames, poses = recording.frames[:], recording.frames.poses
     if not parts:
         with pytest.raises(InputError, match="from 'odom' to the frame of the clouds 'lidar'"):
             bag_format.read(tmp_path / "bag", frames, "/n/output/detections")
-        assert not results.read_recorded_results(poses, stamps()).sources
+        assert not results.read_recorded_results(poses, list_stamps()).sources
         return
     labels = bag_format.read(tmp_path / "bag", frames, "/n/output/detections")
-    shown = results.read_recorded_results(poses, stamps())
+    shown = results.read_recorded_results(poses, list_stamps())
     for i, (frame, each) in enumerate(zip(frames, labels.frames)):
-        near = transform_boxes(boxes, invert_pose(base_at(frame.stamp_ns) @ ON_BASE))
+        near = transform_boxes(boxes, invert_pose(compute_base_pose(frame.stamp_ns) @ ON_BASE))
         np.testing.assert_allclose(each.boxes, near, atol=1e-3)
         np.testing.assert_allclose(shown.sources["n"].detect(i, frame).boxes, near, atol=1e-3)
         np.testing.assert_allclose(shown.tracks[0]["boxes"][i][1:8], near[0], atol=1e-3)
 
 
 def test_scans_with_equal_stamps_are_kept(tmp_path):
-    twice = frames_at([0.0, 0.1, 0.1])
+    twice = make_frames_at([0.0, 0.1, 0.1])
     write_dataset("nuscenes", twice, tmp_path / "nuscenes")
     assert len({f.points for f in open_recording(tmp_path / "nuscenes")}) == 3
     skipped = []
@@ -268,7 +280,7 @@ def test_scans_with_equal_stamps_are_kept(tmp_path):
     truth = GroundTruth.of(np.ones((1, 7)), [CAR])
     assert write_bag(tmp_path / "bag", [replace(f, truth=lambda: truth) for f in twice], skipped=skipped) == 2
     assert "another labelled scan has the same stamp" in skipped[0]
-    unset = [replace(f, stamp_ns=0) for f in frames_at([0, 1])]
+    unset = [replace(f, stamp_ns=0) for f in make_frames_at([0, 1])]
     with BagWriter(tmp_path / "unset") as bag:  # some drivers set no stamp
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
         for i, frame in enumerate(unset, 5):
@@ -276,15 +288,15 @@ def test_scans_with_equal_stamps_are_kept(tmp_path):
     assert [f.stamp_ns for f in open_recording(tmp_path / "unset")] == [5 * 10**9, 6 * 10**9]
 
 
-def test_detections_of_a_bag_become_a_data_set(simulated, tmp_path, monkeypatch, capsys):
-    recording = list(open_recording(simulated))
+def test_detections_of_a_bag_become_a_data_set(simulated_bag, tmp_path, monkeypatch, capsys):
+    recording = list(open_recording(simulated_bag))
     labels = DriveLabels(list(map(read_frame_labels, recording)))
     export = tmp_path / "labels"
     bag_format.write(labels, export, recording)
     for topic in ("/ground_truth/detections", "/ground_truth/detections_3d"):
         out = tmp_path / topic.replace("/", "_")
         assert (
-            exit_of(monkeypatch, "convert", export, "--to", "kitti-tracking", "--detections", topic, "--out", out) == 0
+            run_main(monkeypatch, "convert", export, "--to", "kitti-tracking", "--detections", topic, "--out", out) == 0
         )
         back = open_recording(out)
         found = DriveLabels(
@@ -293,9 +305,9 @@ def test_detections_of_a_bag_become_a_data_set(simulated, tmp_path, monkeypatch,
         expected = labels
         if topic.endswith("3d"):  # each box has a score
             expected = DriveLabels([replace(f, scores=np.ones(len(f))) for f in labels.frames])
-        same(expected, found, 2e-6)
+        assert_equal_labels(expected, found, 2e-6)
     assert (
-        exit_of(monkeypatch, "convert", export, "--detections", "/odom", "--out", tmp_path / "no", "--to", "nuscenes")
+        run_main(monkeypatch, "convert", export, "--detections", "/odom", "--out", tmp_path / "no", "--to", "nuscenes")
         == 2
     )
     capsys.readouterr()
@@ -304,10 +316,10 @@ def test_detections_of_a_bag_become_a_data_set(simulated, tmp_path, monkeypatch,
 def test_poses_are_relative_to_the_first_scan(tmp_path):
     frames = [
         replace(f, point_truth=lambda: PointTruth(np.zeros(50, np.uint16), np.zeros(50, np.uint16)))
-        for f in drive("one", frames=3)
+        for f in make_format_drive("one", frames=3)
     ]
     write_bag(tmp_path / "bag", frames)
     write_dataset("semantickitti", open_recording(tmp_path / "bag"), tmp_path / "s")
-    first = np.linalg.inv(pose(5))
+    first = np.linalg.inv(make_sloped_pose(5))
     for i, frame in enumerate(open_recording(tmp_path / "s")):
-        np.testing.assert_allclose(frame.pose(), first @ pose(5 + i), atol=1e-6)
+        np.testing.assert_allclose(frame.pose(), first @ make_sloped_pose(5 + i), atol=1e-6)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from format_samples import CALIBRATION, drive
+from format_samples import CALIBRATION, make_format_drive
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.data.kitti.labels import DONT_CARE
@@ -22,7 +22,7 @@ HEADING = np.array([math.cos(2.0), math.sin(2.0), 0.0])
 
 
 def make_one_frame():
-    return drive("one", frames=1)
+    return make_format_drive("one", frames=1)
 
 
 def export_box(format, path, box=BOX, **more):
@@ -355,7 +355,7 @@ def test_camera_without_pose_uses_calibration_of_the_drive(tmp_path):
     )
     assert box[3:6].tolist() == [3.9, 1.6, 1.5]
     with pytest.raises(InputError, match="does not define the coordinate system 'lidar'"):
-        import_labels(path, "openlabel", drive("one", frames=1, camera=False))
+        import_labels(path, "openlabel", make_format_drive("one", frames=1, camera=False))
 
 
 def test_openlabel_regions_stay_regions(tmp_path):
@@ -409,7 +409,7 @@ def write_tracklets(path, *tracks):
 
 
 def test_cvat_tracklets_are_read(tmp_path):
-    frames = drive("one")  # numbers 5 to 7
+    frames = make_format_drive("one")  # numbers 5 to 7
     path = write_tracklets(
         tmp_path / "in/tracklet_labels.xml", TRACK.format("car", 5, POSE * 2), TRACK.format("bus", 7, POSE)
     )
@@ -425,7 +425,7 @@ def test_cvat_tracklets_are_read(tmp_path):
     write_tracklets(path, TRACK.format("Car", 9, POSE))
     with pytest.raises(InputError, match=r"has labels of frame 9 .* the drive has frames 5 to 7"):
         import_labels(path, "kitti-raw", frames)
-    several = drive("several")
+    several = make_format_drive("several")
     with pytest.raises(InputError, match="is a single file, but the frames belong to 2 drives"):
         import_labels(path, "kitti-raw", several)
     with pytest.raises(InputError, match="has no tracklet_labels"):
@@ -436,7 +436,7 @@ def test_cvat_tracklets_are_read(tmp_path):
 
 
 def test_openpcdet_labels_are_read(tmp_path):
-    frames = drive("one")
+    frames = make_format_drive("one")
     folder = tmp_path / "labels"
     folder.mkdir()
     (folder / "000006.txt").write_bytes(

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from format_samples import DRIVES, EXACT, KITTI, NOTES, drive, make_labels, same
+from format_samples import DRIVES, EXACT, KITTI, NOTES, assert_equal_labels, make_format_drive, make_labels
 from samples import DATA, needs_data
 
 from lidar_perception.data.open import open_recording
@@ -21,23 +21,23 @@ REAL = {"kitti-tracking": "kitti_tracking/training/label_02", "kitti": "kitti_ob
 @pytest.mark.parametrize("format", FORMATS)
 @pytest.mark.parametrize("name", DRIVES)
 def test_exported_labels_are_imported_again(format, name, tmp_path):
-    frames = drive(name)
+    frames = make_format_drive(name)
     labels = make_labels(frames, format)
     written = export_labels(labels, format, tmp_path / "out", frames)
     assert (written.boxes, written.frames) == (labels.box_count, len(frames))
     read = import_labels(tmp_path / "out", format, frames)
-    same(labels, read, EXACT[format])
+    assert_equal_labels(labels, read, EXACT[format])
 
 
 @pytest.mark.parametrize("format", FORMATS)
 @pytest.mark.parametrize("name", DRIVES)
 def test_second_export_is_identical(format, name, tmp_path):
-    frames = drive(name)
+    frames = make_format_drive(name)
     export_labels(make_labels(frames, format), format, tmp_path / "first", frames)
     read = import_labels(tmp_path / "first", format, frames)
     export_labels(read, format, tmp_path / "second", frames)
     again = import_labels(tmp_path / "second", format, frames)
-    same(read, again, max(EXACT[format], 1e-9) if format == VERTICES else 1e-9)
+    assert_equal_labels(read, again, max(EXACT[format], 1e-9) if format == VERTICES else 1e-9)
     assert read.extra == again.extra
     for each, other in zip(read.frames, again.frames):
         assert (each.extra, each.notes) == (other.extra, other.notes)
@@ -76,7 +76,7 @@ def test_only_moved_boxes_get_new_columns(tmp_path):
         "Car 0.27 1 -1.57 600.00 150.00 700.00 250.00 1.50 1.60 3.90 0.50 1.70 30.00 -1.57\n"
         "DontCare -1 -1 -10 10.00 20.00 30.00 40.00 -1 -1 -1 -1000 -1000 -1000 -10\n"
     )
-    frames = drive("one", frames=1)
+    frames = make_format_drive("one", frames=1)
     folder = tmp_path / "label_2"
     folder.mkdir()
     (folder / "000005.txt").write_text(text)

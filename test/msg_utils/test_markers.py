@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import STAMP, each_make, header
+from samples import STAMP, each_make, make_any_header
 
 from lidar_perception.types import CLASSES, GroundTruth
 from lidar_perception.wire import codec
@@ -40,9 +40,9 @@ objects = st.lists(st.tuples(boxes, st.sampled_from(CLASSES) | words, st.floats(
 notes = st.lists(st.tuples(words, contents), max_size=2)
 
 
-def array(make, rows, **more):
+def make_array(make, rows, **more):
     return to_marker_array(
-        np.array([box for box, *_ in rows]), [r[1] for r in rows], header=header(make), make=make, **more
+        np.array([box for box, *_ in rows]), [r[1] for r in rows], header=make_any_header(make), make=make, **more
     )
 
 
@@ -50,7 +50,7 @@ def keys(rows):
     return [(label, i) for i, (_, label, *_) in enumerate(rows)]
 
 
-def same_boxes(a, b) -> bool:
+def are_equal_boxes(a, b) -> bool:
     """Return True for equal boxes, up to rounding of the yaw, with pi equal to -pi."""
     a, b = (np.reshape(x, (-1, 7)) for x in (a, b))
     turned = np.abs((a[:, 6] - b[:, 6] + np.pi) % (2 * np.pi) - np.pi)
@@ -61,7 +61,7 @@ def same_boxes(a, b) -> bool:
 @given(rows=objects, remarks=notes)
 def test_marker_array_survives_conversion_and_back(make, rows, remarks):
     result = from_marker_array(
-        array(
+        make_array(
             make,
             rows,
             scores=[r[2] for r in rows],
@@ -70,7 +70,7 @@ def test_marker_array_survives_conversion_and_back(make, rows, remarks):
             ids=range(7, 7 + len(rows)),
         )
     )
-    assert same_boxes(result.boxes, [r[0] for r in rows])
+    assert are_equal_boxes(result.boxes, [r[0] for r in rows])
     assert result.labels == [r[1] for r in rows]
     assert result.scores.tolist() == [r[2] for r in rows]
     assert result.extras == [{**r[3], "score": r[2]} for r in rows]
@@ -81,7 +81,9 @@ def test_marker_array_survives_conversion_and_back(make, rows, remarks):
 
 @given(rows=objects, remarks=notes)
 def test_markers_survive_serialization(rows, remarks):
-    sent = array(codec.make_bag_message, rows, scores=[r[2] for r in rows], extras=[r[3] for r in rows], notes=remarks)
+    sent = make_array(
+        codec.make_bag_message, rows, scores=[r[2] for r in rows], extras=[r[3] for r in rows], notes=remarks
+    )
     raw = codec.encode(sent)
     read = codec.decode(raw, "visualization_msgs/msg/MarkerArray")
     assert codec.encode(read) == raw
@@ -105,8 +107,8 @@ def test_quaternion_is_normalized_and_rotates_about_z_only(make, yaw):
 @each_make
 @given(before=objects, after=objects)
 def test_only_outdated_markers_are_deleted(make, before, after):
-    first = array(make, before)
-    second = array(make, after, previous=list_marker_keys(first))
+    first = make_array(make, before)
+    second = make_array(make, after, previous=list_marker_keys(first))
     assert list_marker_keys(first) == {*keys(before)}
     deleted = [(m.ns, m.id) for m in second.markers if m.action == DELETE]
     gone = {*keys(before)} - {*keys(after)}
@@ -117,7 +119,7 @@ def test_only_outdated_markers_are_deleted(make, before, after):
 
 @each_make
 def test_empty_array_keeps_frame_and_stamp(make):
-    msg = array(make, [])
+    msg = make_array(make, [])
     result = from_marker_array(msg)
     assert len(result) == 0 and result.boxes.shape == (0, 7) and result.notes == []
     assert (result.stamp_ns, result.frame_id) == (STAMP, "velodyne")
@@ -151,7 +153,7 @@ def test_message_without_markers_has_no_detections(make):
 def test_cubes_of_other_nodes_are_read(make, text, score, extra):
     cube = make(
         "visualization_msgs/msg/Marker",
-        header=header(make, 5, "map"),
+        header=make_any_header(make, 5, "map"),
         ns="car",
         id=4,
         type=CUBE,
@@ -160,10 +162,10 @@ def test_cubes_of_other_nodes_are_read(make, text, score, extra):
         pose=make_box_pose(np.array([1.0, 2, 3, 4, 5, 6, -2.0]), make),
         scale=make("geometry_msgs/msg/Vector3", x=4.0, y=5.0, z=6.0),
     )
-    sphere = make("visualization_msgs/msg/Marker", header=header(make), type=2, action=ADD)
+    sphere = make("visualization_msgs/msg/Marker", header=make_any_header(make), type=2, action=ADD)
     clear = make("visualization_msgs/msg/Marker", action=3)  # DELETEALL, often without a header
     result = from_marker_array(make("visualization_msgs/msg/MarkerArray", markers=[clear, cube, sphere]))
-    assert same_boxes(result.boxes, [[1, 2, 3, 4, 5, 6, -2.0]])
+    assert are_equal_boxes(result.boxes, [[1, 2, 3, 4, 5, 6, -2.0]])
     assert (result.labels, result.ids.tolist(), result.frame_id, result.stamp_ns) == (["car"], [4], "map", 5)
     assert result.scores.tolist() == [score] and result.extras == [extra]
     assert CLASSES[to_truth(result).class_ids[0]] == "Car"
@@ -173,13 +175,13 @@ def test_cubes_of_other_nodes_are_read(make, text, score, extra):
 @each_make
 def test_arrays_of_different_length_are_rejected(make):
     with pytest.raises(ValueError):
-        to_marker_array(np.zeros((2, 7)), ["Car"], header=header(make), make=make)
+        to_marker_array(np.zeros((2, 7)), ["Car"], header=make_any_header(make), make=make)
 
 
 @each_make
 def test_each_cube_has_the_given_lifetime_and_color(make):
     rows = [((0, 0, 0, 1, 1, 1, 0), label, 1.0, {}) for label in ("Car", "unheard of")]
-    msg = array(make, rows, color=(0.25, 0.5, 1.0), lifetime_ns=1_500_000_000)
+    msg = make_array(make, rows, color=(0.25, 0.5, 1.0), lifetime_ns=1_500_000_000)
     for m in msg.markers:
         assert (m.lifetime.sec, m.lifetime.nanosec) == (1, 500_000_000)
         assert (m.color.r, m.color.g, m.color.b) == (0.25, 0.5, 1.0) and 0 < m.color.a < 1
@@ -190,7 +192,7 @@ def test_each_cube_has_the_given_lifetime_and_color(make):
 def test_unique_track_ids_become_detection_ids(make, tracks, ids):
     extras = [{} if t is None else {"track_id": t} for t in tracks]
     truth = GroundTruth.of(np.ones((len(tracks), 7)), [0] * len(tracks), extras, [("DontCare", {"track_id": -1})])
-    result = from_marker_array(make_truth_markers(truth, header(make), make))
+    result = from_marker_array(make_truth_markers(truth, make_any_header(make), make))
     assert result.ids.tolist() == ids
     assert to_truth(result).extras == truth.extras and to_truth(result).notes == truth.notes
 
@@ -201,7 +203,7 @@ def test_detection_array_survives_conversion_and_back(rows):
         np.array([r[0] for r in rows]),
         [r[1] for r in rows],
         [r[2] for r in rows],
-        header=header(codec.make_bag_message),
+        header=make_any_header(codec.make_bag_message),
         make=codec.make_bag_message,
     )
     for read in (msg, codec.decode(codec.encode(msg), "vision_msgs/msg/Detection3DArray")):
@@ -209,7 +211,7 @@ def test_detection_array_survives_conversion_and_back(rows):
         assert [d.id for d in read.detections] == [str(i) for i in range(len(rows))]
         assert result.ids.tolist() == list(range(len(rows))) and result.extras == [{}] * len(rows)
         assert not any(np.any(r.pose.covariance) for d in read.detections for r in d.results)
-        assert same_boxes(result.boxes, [r[0] for r in rows])
+        assert are_equal_boxes(result.boxes, [r[0] for r in rows])
         assert result.labels == [r[1] for r in rows]
         assert result.scores.tolist() == [r[2] for r in rows]
         assert (result.stamp_ns, result.frame_id) == (STAMP, "velodyne")
@@ -217,7 +219,11 @@ def test_detection_array_survives_conversion_and_back(rows):
 
 def test_detection_has_its_most_likely_class():
     msg = to_detection_array(
-        np.ones((2, 7)), ["Car", "Van"], [0.3, 0.5], header=header(codec.make_bag_message), make=codec.make_bag_message
+        np.ones((2, 7)),
+        ["Car", "Van"],
+        [0.3, 0.5],
+        header=make_any_header(codec.make_bag_message),
+        make=codec.make_bag_message,
     )
     msg.detections[0].results.extend(msg.detections[1].results)
     msg.detections[1].results.clear()

@@ -128,7 +128,7 @@ def test_views_look_ahead():
     assert depth[3] < depth[0]
 
 
-def pictures(count):
+def make_pictures(count):
     return [np.full((90, 160, 3), 40 * k, np.uint8) for k in range(count)]
 
 
@@ -139,7 +139,7 @@ def test_video_has_every_picture_with_its_duration(name, tmp_path):
         pytest.importorskip("av", reason="needs PyAV, the extra [video]")
     check_video(path, 4)
     with open_video(path, (160, 90)) as made:
-        for k, picture in enumerate(pictures(4)):
+        for k, picture in enumerate(make_pictures(4)):
             made.add(picture, 0.1 if k else 0.3)
         assert not path.exists()
     assert [p.name for p in path.parent.iterdir()] == [name]
@@ -170,7 +170,7 @@ def test_failed_or_empty_video_leaves_no_file(tmp_path):
         with open_video(tmp_path / f"a{suffix}", (160, 90)):
             pass
     with pytest.raises(ZeroDivisionError), open_video(tmp_path / "a.gif", (160, 90)) as made:
-        made.add(pictures(1)[0], 1 / 0)
+        made.add(make_pictures(1)[0], 1 / 0)
     assert not [*tmp_path.iterdir()]
 
 

@@ -21,7 +21,7 @@ RENDER_SETTINGS = {
 each_range = pytest.mark.parametrize("render_settings", RENDER_SETTINGS.values(), ids=RENDER_SETTINGS)
 
 
-def cloud(seed=0, count=2000):
+def make_cloud(seed=0, count=2000):
     rng = np.random.default_rng(seed)
     xyz = rng.uniform([-30, -30, -1.8], [40, 30, 2], (count, 3)).astype(np.float32)
     return PointCloud(xyz, rng.uniform(0, 1, count).astype(np.float32))
@@ -65,7 +65,7 @@ def test_labels_trails_and_arrows_are_drawn(render_settings):
 @settings(max_examples=10)
 @given(st.integers(0, 1000))
 def test_order_of_points_and_boxes_does_not_matter(render_settings, seed):
-    rng, scan = np.random.default_rng(seed), cloud(seed, 300)
+    rng, scan = np.random.default_rng(seed), make_cloud(seed, 300)
     scan.xyz[:, 2] += np.linspace(0, 1, 300)  # all depths differ
     boxes = np.vstack([BOX, BOX + [9, 8, 0, 0, 0, 0, 1]])
     order, turned = rng.permutation(len(scan)), slice(None, None, -1)
@@ -90,7 +90,7 @@ def test_point_colour_is_height_or_intensity(render_settings):
 
 
 def test_given_point_colours_are_not_modified():
-    scan = cloud()
+    scan = make_cloud()
     ground, clusters = scan.xyz[:, 2] < -1.5, (scan.xyz[:, 0] > 10).astype(int)
     colors = color_by_cluster(ground, clusters)
     before = colors.copy()

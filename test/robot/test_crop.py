@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import header, scene
+from samples import make_any_header, make_scene
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.candidates.params import PipelineParams
@@ -108,7 +108,7 @@ def test_disabled_crop_returns_the_same_frame():
 
 def test_cropping_before_or_inside_the_pipeline_is_equivalent():
     """Indices refer to the given cloud, and a second crop removes nothing."""
-    frame = PointCloud(np.ascontiguousarray(scene()[:, :3]))
+    frame = PointCloud(np.ascontiguousarray(make_scene()[:, :3]))
     params = with_values(PipelineParams(), {"crop.min_range": 4.0, "crop.sectors": (90.0, 270.0)})
     kept, before = crop_frame(frame, params.crop)
     assert 0 < len(kept) < len(frame)
@@ -124,7 +124,7 @@ def test_cropped_message_has_points_of_cropped_frame():
     for i, name in enumerate("xyz"):
         cloud[name] = make_points(300)[:, i]
     cloud["x"][::7] = np.nan
-    frame, usable = to_point_cloud(from_array(cloud, header(make_bag_message), make_bag_message))
+    frame, usable = to_point_cloud(from_array(cloud, make_any_header(make_bag_message), make_bag_message))
     kept, _ = crop_frame(frame, CROP)
     finite = np.isfinite(cloud["x"])
     np.testing.assert_array_equal(usable.take(kept), np.flatnonzero(finite & select_points(make_points(300), CROP)))

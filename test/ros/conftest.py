@@ -27,7 +27,7 @@ def good_cloud(drive_bag):
 
 
 @pytest.fixture(scope="module")
-def found(tested, shared_processes, shared_peer, weights):
+def graph_detections(tested, shared_processes, shared_peer, weights):
     """Detections of the graph of the detector under test."""
     from ros_samples import MARKERS, QUIET
 
@@ -47,7 +47,7 @@ def found(tested, shared_processes, shared_peer, weights):
 
 
 @pytest.fixture(scope="module")
-def talker(tested, shared_peer, found):
+def talker(tested, shared_peer, graph_detections):
     """Publisher of clouds to the detector."""
     from ros_samples import CLOUD
 
@@ -55,7 +55,7 @@ def talker(tested, shared_peer, found):
 
 
 @pytest.fixture
-def start(domain):
+def start_node(domain):
     """Make a node in this process; node.sent collects its messages by topic."""
     from rclpy.parameter import Parameter
 

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from ros_samples import BAD, CLOUD, MARKERS, QUIET, big_endian, cloud
+from ros_samples import BAD, CLOUD, MARKERS, QUIET, make_ros_cloud, to_big_endian
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.scoring.centres.report import select_pedestrians
@@ -19,7 +19,7 @@ from msg_utils.point_cloud2 import to_array
 from msg_utils.stamps import make_header, to_ns
 
 
-def xyz_of(msg):
+def read_xyz(msg):
     return to_point_cloud(msg)[0].xyz
 
 
@@ -48,12 +48,12 @@ def results(peer):
 def process(send, results):
     """Return a function that sends a cloud to a node and returns the cloud that it publishes."""
 
-    def processed(node, msg):
+    def process_cloud(node, msg):
         stamp, received = to_ns(msg.header.stamp), results[node]
         send(node, msg, lambda: received and to_ns(received[-1].header.stamp) == stamp, "the cloud's result")
         return received[-1]
 
-    return processed
+    return process_cloud
 
 
 @pytest.mark.parametrize("node", ["ground_segmentation", "perception"])
@@ -80,23 +80,23 @@ def test_every_method_survives_invalid_clouds(values, send, process, results, sh
     """Some libraries crash on NaN, outliers or empty clouds."""
     node = "perception" if "clustering.method" in values else "ground_segmentation"
     rng = np.random.default_rng(0)
-    xyz = xyz_of(good_cloud)
+    xyz = read_xyz(good_cloud)
     some = xyz[:2000]
     strange = {
         **{name: msg for name, (msg, _) in BAD.items()},
-        "100 km": cloud(np.concatenate([some, [[1e5, -1e5, 1e5]]])),
-        "1e38": cloud(np.concatenate([some, [[1e38, 0, 0]]])),
-        "upside down": cloud(xyz * [1, -1, -1]),
-        "all equal": cloud(np.full((3000, 3), 7.0)),
-        "no ground": cloud(rng.uniform(3, 9, (3000, 3))),
-        "all ground": cloud(rng.uniform(-30, 30, (3000, 3)) * [1, 1, 0] - [0, 0, 1.73]),
-        "a million": cloud(rng.uniform(-50, 50, (1_000_000, 3)) * [1, 1, 0.05]),
+        "100 km": make_ros_cloud(np.concatenate([some, [[1e5, -1e5, 1e5]]])),
+        "1e38": make_ros_cloud(np.concatenate([some, [[1e38, 0, 0]]])),
+        "upside down": make_ros_cloud(xyz * [1, -1, -1]),
+        "all equal": make_ros_cloud(np.full((3000, 3), 7.0)),
+        "no ground": make_ros_cloud(rng.uniform(3, 9, (3000, 3))),
+        "all ground": make_ros_cloud(rng.uniform(-30, 30, (3000, 3)) * [1, 1, 0] - [0, 0, 1.73]),
+        "a million": make_ros_cloud(rng.uniform(-50, 50, (1_000_000, 3)) * [1, 1, 0.05]),
     }
     before = len(results[node])
     with peer.override_parameters(f"/{node}", values):
         for stamp, msg in enumerate(strange.values(), start=10):
             send(node, msg, lambda: True, "a subscriber")
-            process(node, cloud(some, stamp))
+            process(node, make_ros_cloud(some, stamp))
     assert {r.width for r in results[node][before:]} >= {1_000_000, len(xyz), 2001}
     assert "PatchWork" not in shared_processes.read_log(node)
 
@@ -120,12 +120,14 @@ def test_wrong_height_and_intensity_scale_are_reported(send, peer, good_cloud):
 
 def test_layout_does_not_change_the_result(process, good_cloud):
     """Big-endian, organised and NaN-padded clouds have the same ground as the plain cloud."""
-    xyz = xyz_of(good_cloud)[:40_000]
+    xyz = read_xyz(good_cloud)[:40_000]
     holes = np.full((20_000, 3), np.nan, np.float32)
-    organised = cloud(np.concatenate([xyz, holes, np.zeros_like(holes)]), 103, is_dense=False)
+    organised = make_ros_cloud(np.concatenate([xyz, holes, np.zeros_like(holes)]), 103, is_dense=False)
     organised.height, organised.width = 8, 10_000
     organised.row_step = organised.width * organised.point_step
-    clouds = [process("ground_segmentation", msg) for msg in (cloud(xyz, 101), big_endian(xyz, 102), organised)]
+    clouds = [
+        process("ground_segmentation", msg) for msg in (make_ros_cloud(xyz, 101), to_big_endian(xyz, 102), organised)
+    ]
     plain, big, grid = (to_array(msg)["ground"] for msg in clouds)
     assert plain.sum() > 1000
     np.testing.assert_array_equal(plain, big)

@@ -24,7 +24,7 @@ from msg_utils.markers import from_marker_array
 from msg_utils.stamps import to_ns
 
 
-def offline(frame):
+def find_offline_candidates(frame):
     people = select_pedestrians(frame.truth())
     if not len(people):
         return Detections.none()
@@ -37,7 +37,7 @@ def offline(frame):
     ids=["three nodes, latched", "one node, a driver's"],
 )
 def test_cloud_before_its_camera_info_gives_offline_detections(graph, qos, processes, peer, drive_bag):
-    frame, expected = next((f, e) for f in open_recording(drive_bag) if len(e := offline(f)))
+    frame, expected = next((f, e) for f in open_recording(drive_bag) if len(e := find_offline_candidates(f)))
     with Bag(drive_bag) as bag:
         sent = {
             topic: msg

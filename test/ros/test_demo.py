@@ -12,7 +12,7 @@ import torch
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from bag_samples import message_bytes
-from cli_samples import exit_of
+from cli_samples import run_main
 from click.testing import CliRunner
 from detector_node import assert_equal
 
@@ -97,7 +97,7 @@ def test_parameters_reach_the_nodes(drive_bag, tmp_path, monkeypatch, arguments,
             raise InputError("enough")
 
     monkeypatch.setattr(graph_replay.Processes, "start", start)
-    assert exit_of(monkeypatch, "demo", drive_bag, *arguments, "--out", tmp_path / "out") == 2
+    assert run_main(monkeypatch, "demo", drive_bag, *arguments, "--out", tmp_path / "out") == 2
     assert expected.items() <= given[node].items()
 
 
@@ -123,5 +123,5 @@ def test_demo_keeps_files_that_it_did_not_create(drive_bag, make_bag, tmp_path):
     ],
 )
 def test_demo_rejects_parameters_of_another_detector(tmp_path, monkeypatch, capsys, arguments, words):
-    assert exit_of(monkeypatch, "demo", *arguments, "--out", tmp_path / "out") == 2
+    assert run_main(monkeypatch, "demo", *arguments, "--out", tmp_path / "out") == 2
     assert words in capsys.readouterr().err and not (tmp_path / "out").exists()

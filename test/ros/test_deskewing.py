@@ -9,7 +9,16 @@ from motion_samples import skew
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from motion_samples import make_constant_motion
-from robot_messages import PERIOD, START, give, message, mount_pose, odometry, problems, transforms
+from robot_messages import (
+    PERIOD,
+    START,
+    deliver_cloud,
+    list_problems,
+    make_base_odometry,
+    make_robot_cloud,
+    mount_pose,
+    transforms,
+)
 
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.wire.codec import decode, encode, make_bag_message
@@ -20,13 +29,13 @@ from msg_utils.stamps import make_time
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def drive(at_ns):
+def compute_base_pose(at_ns):
     """Return the pose of the base in odom: 15 m/s on a left turn."""
     return make_constant_motion([15.0, 0.0, 0.0], [0.0, 0.0, 0.5])(np.array([(at_ns - START) * 1e-9]))[0]
 
 
 @pytest.mark.parametrize("source", ["odometry", "tf"])
-def test_cloud_of_moving_sensor_is_compensated(start, source):
+def test_cloud_of_moving_sensor_is_compensated(start_node, source):
     """Later nodes get the compensated points; those on the robot's body do not move. Without odometry the cloud
     is used uncompensated, with a warning."""
     rng = np.random.default_rng(0)
@@ -41,31 +50,31 @@ def test_cloud_of_moving_sensor_is_compensated(start, source):
     seconds = rng.uniform(0.0, 0.1, len(still))
 
     def poses(at):
-        return np.array([drive(START + round(s * 1e9)) @ sensor for s in at])
+        return np.array([compute_base_pose(START + round(s * 1e9)) @ sensor for s in at])
 
     raw = skew(still, seconds, poses)
     raw[body] = still[body]
-    node = start(
+    node = start_node(
         GroundSegmentation,
         **{"input.deskew": source, "base_frame": "base", "crop.body": [-1.5, -1.5, 0.2, 2.0, 1.5, 2.5]},
     )
     node.transforms.on_tf(transforms(("base", "lidar", sensor, 0)), static=True)
-    msg = message(raw, t=np.rint(seconds * 1e9).astype("<u4"))
+    msg = make_robot_cloud(raw, t=np.rint(seconds * 1e9).astype("<u4"))
 
-    give(node, msg)
+    deliver_cloud(node, msg)
     as_it_is = decode(node.sent["points"][-1], "sensor_msgs/msg/PointCloud2")
     np.testing.assert_array_equal(to_array(as_it_is)["x"], raw[:, 0])
     assert node.diagnostics.counts["not_deskewed"] == 1
-    assert "clouds are not deskewed" in problems(node)
+    assert "clouds are not deskewed" in list_problems(node)
 
     for i in range(-5, 16):
         stamp = START + i * PERIOD // 10
         if source == "tf":
-            node.transforms.on_tf(transforms(("odom", "base", drive(stamp), stamp)), static=False)
+            node.transforms.on_tf(transforms(("odom", "base", compute_base_pose(stamp), stamp)), static=False)
         else:
-            node.transforms.on_odometry(odometry(drive(stamp), stamp))
-    give(node, msg)
-    assert "deskew" not in problems(node) and node.diagnostics.counts["deskewed"] == 1
+            node.transforms.on_odometry(make_base_odometry(compute_base_pose(stamp), stamp))
+    deliver_cloud(node, msg)
+    assert "deskew" not in list_problems(node) and node.diagnostics.counts["deskewed"] == 1
     after = decode(node.sent["points"][-1], "sensor_msgs/msg/PointCloud2")
     moved = np.column_stack([to_array(after)[n] for n in "xyz"])
     others = np.setdiff1d(np.arange(len(still)), body)
@@ -75,46 +84,46 @@ def test_cloud_of_moving_sensor_is_compensated(start, source):
     np.testing.assert_array_equal(moved[body], still[body])
     assert not read_column(after, "in_view", body).any() and not to_array(after)["t"].any()
     frame_, _ = to_point_cloud(after)
-    again = start(GroundSegmentation, **{"input.deskew": source})
+    again = start_node(GroundSegmentation, **{"input.deskew": source})
     again.transforms = node.transforms
-    give(again, after)
+    deliver_cloud(again, after)
     np.testing.assert_array_equal(  # compensated only once
         to_array(decode(again.sent["points"][-1], "sensor_msgs/msg/PointCloud2"))["x"], moved[:, 0]
     )
-    give(node, message(raw, START + PERIOD))
-    assert "no time column" in problems(node) and len(node.sent["points"]) == 3
+    deliver_cloud(node, make_robot_cloud(raw, START + PERIOD))
+    assert "no time column" in list_problems(node) and len(node.sent["points"]) == 3
     assert make_time(START, make_bag_message).sec == after.header.stamp.sec and len(frame_)
 
 
-def test_first_cloud_waits_for_odometry_of_its_sweep(start):
+def test_first_cloud_waits_for_odometry_of_its_sweep(start_node):
     rng = np.random.default_rng(0)
     xyz = (rng.uniform(-30, 30, (2000, 3)) * [1, 1, 0.001] - [0, 0, 1.8]).astype(np.float32)
-    msg = message(xyz, t=np.linspace(0, 1e8, len(xyz)).astype("<u4"))
-    node = start(GroundSegmentation, **{"input.deskew": "odometry"})
+    msg = make_robot_cloud(xyz, t=np.linspace(0, 1e8, len(xyz)).astype("<u4"))
+    node = start_node(GroundSegmentation, **{"input.deskew": "odometry"})
     deliver = node.inputs.receptions[0].deliver
     for i in range(-2, 9):
-        node.transforms.on_odometry(odometry(np.eye(4), START + i * PERIOD // 10, "lidar"))
+        node.transforms.on_odometry(make_base_odometry(np.eye(4), START + i * PERIOD // 10, "lidar"))
     needed = deliver(encode(msg), True)
     assert "/ground_segmentation/input/odometry" in needed and "0.020 s older" in needed
     assert "'lidar'" in needed and "child_frame_id" not in needed
     assert node.diagnostics.counts["frames"] == 0
     for i in (9, 10):
-        node.transforms.on_odometry(odometry(np.eye(4), START + i * PERIOD // 10, "lidar"))
+        node.transforms.on_odometry(make_base_odometry(np.eye(4), START + i * PERIOD // 10, "lidar"))
     assert deliver(encode(msg), True) is None
     assert node.diagnostics.counts["deskewed"] == 1 and "not_deskewed" not in node.diagnostics.counts
 
 
 @pytest.mark.parametrize("first, begin, sectors", [(0.3, 0.0, ()), (1.0, -1.0, (120.0, 240.0))])
-def test_later_clouds_wait_for_the_end_of_their_sweep(start, first, begin, sectors):
+def test_later_clouds_wait_for_the_end_of_their_sweep(start_node, first, begin, sectors):
     """The first sweep is partial, or the stamp is at the end of a sweep whose last points are cropped. Odometry
     arrives every 0.02 s."""
-    node = start(GroundSegmentation, **{"input.deskew": "odometry", "crop.sectors": sectors})
+    node = start_node(GroundSegmentation, **{"input.deskew": "odometry", "crop.sectors": sectors})
     deliver = node.inputs.receptions[0].deliver
     heard = iter(range(START, START + 20 * PERIOD, PERIOD // 5))
 
     def hear():
         stamp = next(heard)
-        node.transforms.on_odometry(odometry(np.eye(4), stamp, "lidar"))
+        node.transforms.on_odometry(make_base_odometry(np.eye(4), stamp, "lidar"))
         return stamp
 
     known = hear()
@@ -125,7 +134,7 @@ def test_later_clouds_wait_for_the_end_of_their_sweep(start, first, begin, secto
         stamp = START + i * PERIOD + PERIOD // 10
         while known < stamp + 1e9 * seconds[-1] - PERIOD // 5:
             known = hear()
-        while deliver(encode(message(xyz, stamp, time=seconds.astype("<f4"))), True):
+        while deliver(encode(make_robot_cloud(xyz, stamp, time=seconds.astype("<f4"))), True):
             known = hear()
     assert node.diagnostics.counts["deskewed"] == 7 - (
         first < 1.0

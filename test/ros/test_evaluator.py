@@ -10,7 +10,7 @@ from marker_messages import make_detection_markers
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from tracking_samples import START, TENTH, crowd
+from tracking_samples import START, TENTH, make_crowd_detections
 
 from lidar_perception.camera import Calibration
 from lidar_perception.nodes.replay.evaluator import MAX_INCOMPLETE_FRAMES, Evaluator
@@ -21,9 +21,9 @@ from lidar_perception.wire.topics import CAMERA_FRAME
 from msg_utils.stamps import make_header
 
 
-def array(number, frame_id="lidar"):
+def make_detections(number, frame_id="lidar"):
     return make_detection_markers(
-        next(crowd()), make_header(START + number * TENTH, frame_id, make_bag_message), make_bag_message
+        next(make_crowd_detections()), make_header(START + number * TENTH, frame_id, make_bag_message), make_bag_message
     )
 
 
@@ -32,33 +32,33 @@ def list_problems(node):
 
 
 @pytest.mark.parametrize("late", [0, MAX_INCOMPLETE_FRAMES - 1, MAX_INCOMPLETE_FRAMES + 30])
-def test_late_labels_are_scored_and_lost_frames_counted_once(start, late):
-    node, count = start(Evaluator), 300
+def test_late_labels_are_scored_and_lost_frames_counted_once(start_node, late):
+    node, count = start_node(Evaluator), 300
     for i in range(count + late):
         if i < count:
-            node._add("final", array(i))
+            node._add("final", make_detections(i))
         if i >= late:
-            node._add("ground_truth", array(i - late))
+            node._add("ground_truth", make_detections(i - late))
     given_up = count - MAX_INCOMPLETE_FRAMES if late > MAX_INCOMPLETE_FRAMES else 0
     assert node.diagnostics.counts["frames"] == count - given_up
     assert node.diagnostics.counts["incomplete"] + len(node.incomplete_frames) == given_up
 
 
-def test_detections_wait_for_their_labels_up_to_a_limit(start):
-    node = start(Evaluator)
+def test_detections_wait_for_their_labels_up_to_a_limit(start_node):
+    node = start_node(Evaluator)
     for name in "final", "ground_truth":
         for i in range(MAX_INCOMPLETE_FRAMES + 30):
-            node._add(name, array(i))
+            node._add(name, make_detections(i))
     assert node.diagnostics.counts["frames"] == MAX_INCOMPLETE_FRAMES and node.diagnostics.counts["incomplete"] == 30
     assert not node.incomplete_frames and node.diagnostics.counts["repeated"] == 30
     assert node.diagnostics.state[1] == "scoring"
 
 
-def test_file_error_is_reported_and_writing_retried(start, tmp_path):
+def test_file_error_is_reported_and_writing_retried(start_node, tmp_path):
     folder = tmp_path / "scores"
     with pytest.raises(InputError, match="give the path of a file"):
-        start(Evaluator, file=str(tmp_path))
-    node = start(Evaluator, file=str(folder / "scores.json"))
+        start_node(Evaluator, file=str(tmp_path))
+    node = start_node(Evaluator, file=str(folder / "scores.json"))
     node._add_time("detector", float("nan"))
     folder.write_text("a file where the folder should be")
     node.write()
@@ -70,19 +70,19 @@ def test_file_error_is_reported_and_writing_retried(start, tmp_path):
     assert list_problems(node) == "" and json.loads((folder / "scores.json").read_text())
 
 
-def test_boxes_in_other_frames_are_scored_with_a_warning(start):
-    node = start(Evaluator)
-    node._add("ground_truth", array(0, "velo"))
-    node._add("final", array(0, "odom"))
+def test_boxes_in_other_frames_are_scored_with_a_warning(start_node):
+    node = start_node(Evaluator)
+    node._add("ground_truth", make_detections(0, "velo"))
+    node._add("final", make_detections(0, "odom"))
     assert node.diagnostics.counts["frames"] == 1
     for words in "ground_truth in 'velo'", "final in 'odom'":
         assert words in list_problems(node)
-    node._add("ground_truth", array(1))
-    node._add("final", array(1))
+    node._add("ground_truth", make_detections(1))
+    node._add("final", make_detections(1))
     assert list_problems(node) == "" and np.isfinite(float(node.diagnostics.counts["F1 of final"]))
 
 
-def objects(stamp, cars=(), cyclists=(), pedestrians=()):
+def make_objects(stamp, cars=(), cyclists=(), pedestrians=()):
     """Return markers of objects at the given distances ahead, each 2 m further to the left."""
     rows = [
         [x, 2.0 * i, -0.9, *size, 0.0, CLASSES.index(name)]
@@ -102,9 +102,9 @@ def objects(stamp, cars=(), cyclists=(), pedestrians=()):
 
 
 @pytest.mark.parametrize("with_camera", [False, True])
-def test_all_classes_are_scored_and_ap_at_the_end(with_camera, start, tmp_path):
+def test_all_classes_are_scored_and_ap_at_the_end(with_camera, start_node, tmp_path):
     file = tmp_path / "scores.json"
-    node = start(Evaluator, file=str(file))
+    node = start_node(Evaluator, file=str(file))
     if with_camera:
         camera = Calibration(
             np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]]),
@@ -126,8 +126,8 @@ def test_all_classes_are_scored_and_ap_at_the_end(with_camera, start, tmp_path):
         (dict(pedestrians=[8]), dict(pedestrians=[8], cyclists=[14])),
     ]
     for i, (truth, found) in enumerate(frames):
-        node._add("ground_truth", objects(START + i, **truth))
-        node._add("final", objects(START + i, **found))
+        node._add("ground_truth", make_objects(START + i, **truth))
+        node._add("final", make_objects(START + i, **found))
     node.close()
     content = json.loads(file.read_text())
 
@@ -153,6 +153,6 @@ def test_all_classes_are_scored_and_ap_at_the_end(with_camera, start, tmp_path):
         ({"timing": ["foo"]}, "does not have the form"),
     ],
 )
-def test_unusable_parameters_are_rejected(start, values, words):
+def test_unusable_parameters_are_rejected(start_node, values, words):
     with pytest.raises(InputError, match=words):
-        start(Evaluator, **values)
+        start_node(Evaluator, **values)

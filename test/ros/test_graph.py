@@ -37,15 +37,15 @@ RUNS = {  # single process, processes, parameters in addition to PAPER
 
 
 @pytest.fixture(scope="module", params=RUNS.values(), ids=RUNS)
-def setting(request):
+def graph_setting(request):
     single, processes, values = request.param
     return single, processes, with_values(PAPER, values)
 
 
 @pytest.fixture(scope="module")
-def run(setting, drive_bag, tmp_path_factory):
+def graph_run(graph_setting, drive_bag, tmp_path_factory):
     """One replay: whether it is a single process, its scores, and the folder of the result bag."""
-    single, processes, params = setting
+    single, processes, params = graph_setting
     out = tmp_path_factory.mktemp("run")
     with Bag(drive_bag) as bag, pytest.MonkeyPatch.context() as patch:
         clouds = bag.counts[POINTS]
@@ -54,9 +54,9 @@ def run(setting, drive_bag, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def offline(setting, drive_bag):
+def offline_results(graph_setting, drive_bag):
     """Candidates of the offline pipeline by stamp, and its report."""
-    report, results, params = CandidateReport(), {}, setting[-1]
+    report, results, params = CandidateReport(), {}, graph_setting[-1]
     for frame in open_recording(drive_bag):
         people = select_pedestrians(frame.truth())
         if len(people):
@@ -67,29 +67,29 @@ def offline(setting, drive_bag):
     return results, report
 
 
-def test_no_frame_is_lost_between_processes(run):
-    _, content, _ = run
+def test_no_frame_is_lost_between_processes(graph_run):
+    _, content, _ = graph_run
     assert content["results"] == content["clouds"] == content["frames"]
     assert content["lost_frames"] == 0
 
 
-def test_candidates_over_dds_equal_offline_candidates(run, offline):
-    single, _, out = run
+def test_candidates_over_dds_equal_offline_candidates(graph_run, offline_results):
+    single, _, out = graph_run
     for stage, topic in list_result_topics(single).items():
         with Bag(out / "result") as bag:
             messages = [from_marker_array(m) for _, _, m in bag.messages({topic})]
         received = {m.stamp_ns: to_detections(m) for m in messages}
-        assert received.keys() == offline[0].keys()
+        assert received.keys() == offline_results[0].keys()
         assert any(len(d) for d in received.values())
         for stamp, detections in received.items():
-            expected = getattr(offline[0][stamp][1], stage)
+            expected = getattr(offline_results[0][stamp][1], stage)
             np.testing.assert_array_equal(detections.boxes, expected.boxes)
             np.testing.assert_array_equal(detections.scores, expected.scores)
             np.testing.assert_array_equal(detections.class_ids, expected.class_ids)
 
 
-def test_published_cloud_has_all_fields_and_offline_columns(run, offline, drive_bag):
-    single, _, out = run
+def test_published_cloud_has_all_fields_and_offline_columns(graph_run, offline_results, drive_bag):
+    single, _, out = graph_run
     with Bag(drive_bag) as bag:
         sent = {to_point_cloud(m)[0].stamp_ns: m for _, _, m in bag.messages({POINTS})}
     with Bag(out / "result") as bag:
@@ -100,22 +100,22 @@ def test_published_cloud_has_all_fields_and_offline_columns(run, offline, drive_
         original = to_array(sent[frame.stamp_ns])
         for name in original.dtype.names:
             np.testing.assert_array_equal(to_array(msg)[name], original[name])
-        segmented, _ = offline[0][frame.stamp_ns]
+        segmented, _ = offline_results[0][frame.stamp_ns]
         np.testing.assert_array_equal(indices, segmented.indices)
         np.testing.assert_array_equal(read_column(msg, "ground", indices) > 0, segmented.ground)
         np.testing.assert_array_equal(read_column(msg, "cluster_id", indices), segmented.cluster_ids)
         assert msg.header.frame_id == "velodyne"
 
 
-def test_evaluator_scores_equal_offline_scores(run, offline):
-    _, content, out = run
-    expected = json.loads(json.dumps(offline[1].compute()))
+def test_evaluator_scores_equal_offline_scores(graph_run, offline_results):
+    _, content, out = graph_run
+    expected = json.loads(json.dumps(offline_results[1].compute()))
     for key in ("frames", "ground_truth", "ground_truth_by_range", "stage1", "stage2", "final"):
-        assert _rounded(content[key]) == _rounded(expected[key])
+        assert _round_values(content[key]) == _round_values(expected[key])
     assert json.loads((out / "logs" / "scores.json").read_text())["frames"] == expected["frames"]
 
 
-def _rounded(value):
+def _round_values(value):
     if isinstance(value, dict):
-        return {k: _rounded(v) for k, v in value.items()}
+        return {k: _round_values(v) for k, v in value.items()}
     return round(value, 6) if isinstance(value, float) else value

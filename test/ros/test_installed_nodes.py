@@ -38,7 +38,7 @@ def blocks_signals(thread: Path) -> bool:
     return all(blocked >> (number - 1) & 1 for number in STOP_SIGNALS)
 
 
-def shared_segments(process: Path) -> set[Path]:
+def find_shared_segments(process: Path) -> set[Path]:
     """Return the Fast DDS segments that a process created; it keeps their lock files open."""
     opened = {file.readlink() for file in (process / "fd").iterdir() if file.is_symlink()}
     return {
@@ -61,7 +61,7 @@ def wait_for_stage(process: subprocess.Popen, stage: str, log: Path) -> None:
         sleep(0.01)
 
 
-def start(processes, how: str, node: str, *arguments: str) -> tuple[subprocess.Popen, Path]:
+def start_process(processes, how: str, node: str, *arguments: str) -> tuple[subprocess.Popen, Path]:
     processes.run(node, [*map(str, STARTED_BY[how](node)), *arguments])
     return processes.running[node], processes.logs / f"{node}.log"
 
@@ -77,12 +77,12 @@ def start(processes, how: str, node: str, *arguments: str) -> tuple[subprocess.P
     ],
 )
 def test_node_stops_cleanly_at_any_stage(how, node, stage, number, processes):
-    process, log = start(processes, how, node)
+    process, log = start_process(processes, how, node)
     wait_for_stage(process, stage, log)
     proc = Path(f"/proc/{process.pid}")
     if stage == "ready":
         assert all(map(blocks_signals, (proc / "task").iterdir()))
-    segments = shared_segments(proc)
+    segments = find_shared_segments(proc)
     assert segments or stage not in ("configuring", "ready")  # DDS has started by then
     process.send_signal(number)
     assert process.wait(timeout=60) == 0
@@ -111,7 +111,7 @@ def test_start_script_stops_at_signal_during_command(command, tmp_path):
 @pytest.mark.parametrize("number", sorted(STOP_SIGNALS))
 def test_recorder_completes_its_bag(number, processes, peer, tmp_path):
     bag, note = tmp_path / "bag", make_bag_message(NOTE)
-    process, _ = start(
+    process, _ = start_process(
         processes, "ros2 run", "bag_recorder", "--ros-args", "-p", f"bag:={bag}", "-p", "topics:=[/note]"
     )
     peer.send(

@@ -21,8 +21,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
-def launched(monkeypatch):
-    """Return launched(name)(**arguments), which executes a launch file and returns {name: node}. Its attribute
+def load_launch_file(monkeypatch):
+    """Return load_launch_file(name)(**arguments), which executes a launch file and returns {name: node}. Its attribute
     `messages` has the log of the last call.
     """
     install(monkeypatch)
@@ -49,8 +49,8 @@ SEVERAL = "candidates,pointpillars,pointnet"
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_launch_file_starts_its_graph_or_single_detectors(name, launched):
-    nodes = launched(name)
+def test_launch_file_starts_its_graph_or_single_detectors(name, load_launch_file):
+    nodes = load_launch_file(name)
     detectors = FILES[name].split(",")
     config = str(ROOT / "config" / f"{'fused' if name == 'detectors' else name}.param.yaml")
     started = nodes(points="/cloud", use_sim_time="true", log_level="debug", reliability="reliable")
@@ -85,9 +85,9 @@ def test_launch_file_starts_its_graph_or_single_detectors(name, launched):
 @pytest.mark.parametrize(
     ("processes", "cores", "together"), [("true", 2, False), ("false", 16, True), ("auto", 4, True), ("auto", 5, False)]
 )
-def test_graph_is_one_process_if_requested_or_on_few_cores(processes, cores, together, launched, monkeypatch):
+def test_graph_is_one_process_if_requested_or_on_few_cores(processes, cores, together, load_launch_file, monkeypatch):
     monkeypatch.setattr(graph_module, "count_cores", lambda: cores)
-    nodes = launched("detectors")
+    nodes = load_launch_file("detectors")
     given = dict(
         processes=processes,
         tracking="true",
@@ -135,8 +135,8 @@ def test_graph_is_one_process_if_requested_or_on_few_cores(processes, cores, tog
         ("fused", {"config": "range: all"}, None),
     ],
 )
-def test_expert_nodes_use_the_range_of_the_detectors(detectors, given, expected, launched, tmp_path):
-    nodes = launched("detectors")
+def test_expert_nodes_use_the_range_of_the_detectors(detectors, given, expected, load_launch_file, tmp_path):
+    nodes = load_launch_file("detectors")
     if "config" in given:
         mine = tmp_path / "mine.yaml"
         mine.write_text(f"/**: {{ros__parameters: {{{given['config']}}}}}")
@@ -146,18 +146,18 @@ def test_expert_nodes_use_the_range_of_the_detectors(detectors, given, expected,
 
 
 @pytest.mark.parametrize("detectors", ["pointnet,pointpillars", "pointpillars,pointnet"])
-def test_first_detector_sets_parameters_of_ground_and_clusters(detectors, launched):
-    started = launched("detectors")(detectors=detectors)
+def test_first_detector_sets_parameters_of_ground_and_clusters(detectors, load_launch_file):
+    started = load_launch_file("detectors")(detectors=detectors)
     files = {name: Path(node.parameters[0]).name.split(".")[0] for name, node in started.items()}
     assert files["ground_segmentation"] == files["clustering"] == detectors.split(",")[0]
     assert all(files[f"{name}_detector"] == name for name in detectors.split(","))
 
 
-def test_arguments_override_user_file_and_defaults(launched, tmp_path):
+def test_arguments_override_user_file_and_defaults(load_launch_file, tmp_path):
     """rcl prefers a section with a node's name to /**, the only section of the package's files."""
     for file in (ROOT / "config").glob("*.param.yaml"):
         assert list(read_sections(file)) == ["/**"]
-    nodes = launched("fused")
+    nodes = load_launch_file("fused")
     mine = tmp_path / "mine.yaml"
     mine.write_text(
         "/**/fused_detector: {ros__parameters: {fused: {range: ahead}}}\n"
@@ -186,10 +186,10 @@ def test_arguments_override_user_file_and_defaults(launched, tmp_path):
         ("perception", ""),
     ],
 )  # the package's nodes in another graph
-def test_section_of_unknown_node_is_a_warning(section, words, launched, tmp_path):
+def test_section_of_unknown_node_is_a_warning(section, words, load_launch_file, tmp_path):
     mine = tmp_path / "mine.yaml"
     mine.write_text(f"{section}:\n  ros__parameters: {{input.queue: 2}}\n")
-    nodes = launched("fused")
+    nodes = load_launch_file("fused")
     assert len(nodes(config=str(mine))) == 3
     assert [bool(re.search(words, line)) for line in nodes.messages] == [True] * bool(words)
 
@@ -205,12 +205,12 @@ def test_section_of_unknown_node_is_a_warning(section, words, launched, tmp_path
         ("two_lidars", "lft", "did you mean 'left'"),
     ],
 )
-def test_unknown_launch_argument_is_rejected(name, given, words, launched, drive_bag):
+def test_unknown_launch_argument_is_rejected(name, given, words, load_launch_file, drive_bag):
     with pytest.raises(InputError, match=re.escape(words)):
-        launched(name)(**{given: "1"}, **({"bag": str(drive_bag)} if name == "replay" else {}))
+        load_launch_file(name)(**{given: "1"}, **({"bag": str(drive_bag)} if name == "replay" else {}))
 
 
-def test_replay_declares_the_arguments_of_its_graph(launched):
+def test_replay_declares_the_arguments_of_its_graph(load_launch_file):
     """`ros2 launch --show-args` lists declared arguments only."""
     from lidar_perception.nodes.launching import ARGUMENTS
 
@@ -223,12 +223,12 @@ def test_replay_declares_the_arguments_of_its_graph(launched):
 
 
 @pytest.mark.parametrize("name, given", [("fused", "points"), ("fused", "launch-prefix"), ("two_lidars", "range")])
-def test_known_launch_argument_is_accepted(name, given, launched):
-    assert launched(name)(**{given: "auto"})
+def test_known_launch_argument_is_accepted(name, given, load_launch_file):
+    assert load_launch_file(name)(**{given: "auto"})
 
 
-def test_second_sensor_has_its_own_names(launched):
-    nodes = launched("detectors")
+def test_second_sensor_has_its_own_names(load_launch_file):
+    nodes = load_launch_file("detectors")
     for node in nodes(namespace="left").values():
         assert node.namespace == "left"
         assert not any(topic.startswith("/") for _, topic in node.remappings)
@@ -241,8 +241,8 @@ def test_second_sensor_has_its_own_names(launched):
     assert ("~/input/points", "points") in started["ground_segmentation"].remappings
 
 
-def test_tracking_adds_a_tracker_to_each_detector(launched):
-    nodes = launched("detectors")
+def test_tracking_adds_a_tracker_to_each_detector(load_launch_file):
+    nodes = load_launch_file("detectors")
     started = nodes(
         tracking="true", odometry="/odometry", points="/cloud", namespace="left", name_prefix="a_", detectors=SEVERAL
     )
@@ -263,16 +263,16 @@ def test_tracking_adds_a_tracker_to_each_detector(launched):
     assert "tracker" not in nodes(detectors="pointpillars")
 
 
-def test_single_process_tracks_inside_the_detector(launched):
-    nodes = launched("detectors")
+def test_single_process_tracks_inside_the_detector(load_launch_file):
+    nodes = load_launch_file("detectors")
     for name, node in nodes(tracking="true", single="true").items():
         assert node.executable != "tracker" and node.parameters[1]["tracking.enabled"] is True
         assert "tracking.enabled" in find_node_parameters(name)
         assert ("~/input/odometry", "odom") in node.remappings
 
 
-def test_rviz_topics_follow_the_names_of_the_graph(launched):
-    nodes = launched("detectors")
+def test_rviz_topics_follow_the_names_of_the_graph(load_launch_file):
+    nodes = load_launch_file("detectors")
     assert "rviz2" not in nodes()
     plain = nodes(rviz="true", detectors=SEVERAL, points="/cloud", rviz_frame="base_link", namespace="left")["rviz2"]
     assert dict(plain.remappings) == {"points": "/cloud", "tracker/output/tracks": "candidates_tracker/output/tracks"}
@@ -290,12 +290,12 @@ def test_rviz_topics_follow_the_names_of_the_graph(launched):
 
 
 @pytest.mark.parametrize("name", ["pointpillars", "pointnet", "fused"])
-def test_weights_device_and_range_of_a_detector_are_arguments(name, launched):
+def test_weights_device_and_range_of_a_detector_are_arguments(name, load_launch_file):
     expected = {f"{name}.weights": "w.safetensors", f"{name}.device": "cpu"}
     if name != "pointnet":  # always uses the full range
         expected[f"{name}.range"] = "around"
     for file, weights in (name, "w.safetensors"), ("detectors", f"{name}=w.safetensors"):
-        nodes = launched(file)
+        nodes = load_launch_file(file)
         started = nodes(
             weights=weights,
             device="cpu",
@@ -307,9 +307,9 @@ def test_weights_device_and_range_of_a_detector_are_arguments(name, launched):
 
 @pytest.mark.parametrize("single", ["false", "true"])
 @pytest.mark.parametrize("detectors", ["candidates", "fused", "candidates,pointpillars"])
-def test_replay_connects_player_nodes_and_evaluator(detectors, single, launched, drive_bag):
+def test_replay_connects_player_nodes_and_evaluator(detectors, single, load_launch_file, drive_bag):
     """Also if an including file has arguments of these names."""
-    nodes = launched("replay")
+    nodes = load_launch_file("replay")
     started = nodes(bag=str(drive_bag), detectors=detectors, single=single, scores="scores.json", processes="true")
     names = detectors.split(",")
     assert {*started} == {*build_graph(names, single == "true"), "bag_player", "evaluator"}
@@ -341,9 +341,9 @@ def test_replay_connects_player_nodes_and_evaluator(detectors, single, launched,
         ({"config": "all.yaml"}, "config: parameter file not found: all.yaml"),
     ],
 )
-def test_unusable_launch_argument_is_rejected(given, words, launched):
+def test_unusable_launch_argument_is_rejected(given, words, load_launch_file):
     with pytest.raises(InputError, match=words):
-        launched("detectors")(**given)
+        load_launch_file("detectors")(**given)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "test/launch").glob("*.py")), ids=lambda p: p.stem)

@@ -40,7 +40,7 @@ def make_cloud(stamp_ns=10**18):
 
 
 @pytest.fixture
-def graph(domain):
+def linked_nodes(domain):
     """Ground segmentation and clustering, linked, and a function that spins both."""
     context, links = create_context(domain), Links()
     ground = GroundSegmentation(context=context, links=links)
@@ -61,75 +61,75 @@ def graph(domain):
     shut_down_context(context, ground, clustering)
 
 
-def test_linked_nodes_pass_messages_without_dds(graph, monkeypatch):
-    assert graph.reception.subscription is None
-    assert graph.ground.points.get_subscription_count() == 1
+def test_linked_nodes_pass_messages_without_dds(linked_nodes, monkeypatch):
+    assert linked_nodes.reception.subscription is None
+    assert linked_nodes.ground.points.get_subscription_count() == 1
     sent, received = [], []
-    monkeypatch.setattr(graph.ground.points.publisher, "publish", sent.append)
-    monkeypatch.setattr(graph.reception, "deliver", lambda msg, _: received.append(msg))
-    graph.ground.on_points(cloud := make_cloud())
-    graph.spin()
+    monkeypatch.setattr(linked_nodes.ground.points.publisher, "publish", sent.append)
+    monkeypatch.setattr(linked_nodes.reception, "deliver", lambda msg, _: received.append(msg))
+    linked_nodes.ground.on_points(cloud := make_cloud())
+    linked_nodes.spin()
     (message,) = received
     assert message.header is cloud.header and not sent
-    graph.ground.create_subscription(load_message_class(CLOUD), GROUND_POINTS, lambda _: None, RELIABLE)
-    graph.spin()
-    graph.ground.on_points(cloud)
+    linked_nodes.ground.create_subscription(load_message_class(CLOUD), GROUND_POINTS, lambda _: None, RELIABLE)
+    linked_nodes.spin()
+    linked_nodes.ground.on_points(cloud)
     assert sent == [encode(message)]
-    assert graph.reception.values() == {"lost": 0, "dropped": 0, "reliability": "in this process"}
+    assert linked_nodes.reception.values() == {"lost": 0, "dropped": 0, "reliability": "in this process"}
 
 
-def test_only_the_newest_linked_message_is_kept(graph, monkeypatch):
+def test_only_the_newest_linked_message_is_kept(linked_nodes, monkeypatch):
     received = []
-    monkeypatch.setattr(graph.reception, "deliver", lambda msg, _: received.append(msg))
-    graph.ground.on_points(make_cloud(10**18))
-    graph.spin()
+    monkeypatch.setattr(linked_nodes.reception, "deliver", lambda msg, _: received.append(msg))
+    linked_nodes.ground.on_points(make_cloud(10**18))
+    linked_nodes.spin()
     for i in range(1, 10):
-        graph.ground.on_points(make_cloud(10**18 + i))
-    graph.spin()
+        linked_nodes.ground.on_points(make_cloud(10**18 + i))
+    linked_nodes.spin()
     assert [m.header.stamp.nanosec for m in received] == [0, 9]
-    assert graph.reception.arrivals.sent == 10 and graph.reception.arrivals.dropped == 8
+    assert linked_nodes.reception.arrivals.sent == 10 and linked_nodes.reception.arrivals.dropped == 8
 
 
-def test_second_publisher_ends_the_link(graph, monkeypatch):
-    other = graph.clustering.create_publisher(load_message_class(CLOUD), GROUND_POINTS, RELIABLE)
-    graph.reception.adapt()
-    assert graph.reception.subscription is not None and not graph.ground.points.receivers
-    assert any("2 publishers" in text for _, _, text in graph.reception.problems())
-    graph.clustering.destroy_publisher(other)
-    graph.reception.adapt()
-    assert graph.reception.subscription is None and graph.ground.points.receivers
+def test_second_publisher_ends_the_link(linked_nodes, monkeypatch):
+    other = linked_nodes.clustering.create_publisher(load_message_class(CLOUD), GROUND_POINTS, RELIABLE)
+    linked_nodes.reception.adapt()
+    assert linked_nodes.reception.subscription is not None and not linked_nodes.ground.points.receivers
+    assert any("2 publishers" in text for _, _, text in linked_nodes.reception.problems())
+    linked_nodes.clustering.destroy_publisher(other)
+    linked_nodes.reception.adapt()
+    assert linked_nodes.reception.subscription is None and linked_nodes.ground.points.receivers
 
 
-def test_link_is_removed_and_restored_with_its_nodes(graph):
-    assert graph.ground.points.receivers
-    graph.clustering.trigger_deactivate()
-    assert not graph.ground.points.receivers
-    graph.clustering.trigger_activate()
-    graph.ground.trigger_deactivate()
-    graph.ground.trigger_cleanup()
-    graph.spin()
-    assert graph.reception.output is None and graph.reception.subscription is not None
-    graph.ground.trigger_configure()
-    graph.spin()
-    assert graph.reception.output is graph.ground.points
+def test_link_is_removed_and_restored_with_its_nodes(linked_nodes):
+    assert linked_nodes.ground.points.receivers
+    linked_nodes.clustering.trigger_deactivate()
+    assert not linked_nodes.ground.points.receivers
+    linked_nodes.clustering.trigger_activate()
+    linked_nodes.ground.trigger_deactivate()
+    linked_nodes.ground.trigger_cleanup()
+    linked_nodes.spin()
+    assert linked_nodes.reception.output is None and linked_nodes.reception.subscription is not None
+    linked_nodes.ground.trigger_configure()
+    linked_nodes.spin()
+    assert linked_nodes.reception.output is linked_nodes.ground.points
 
 
-def test_recorder_gets_linked_messages_without_dds(graph, monkeypatch, tmp_path):
+def test_recorder_gets_linked_messages_without_dds(linked_nodes, monkeypatch, tmp_path):
     recorder = BagRecorder(
-        context=graph.context,
-        links=graph.ground.links,
+        context=linked_nodes.context,
+        links=linked_nodes.ground.links,
         cli_args=["--ros-args", "-p", f"bag:={tmp_path}/bag", "-p", f"topics:=['{GROUND_POINTS}']"],
     )
     published = []
-    monkeypatch.setattr(graph.ground.points.publisher, "publish", published.append)
-    graph.ground.on_points(make_cloud())
-    other = graph.clustering.create_publisher(load_message_class(CLOUD), GROUND_POINTS, RELIABLE)
+    monkeypatch.setattr(linked_nodes.ground.points.publisher, "publish", published.append)
+    linked_nodes.ground.on_points(make_cloud())
+    other = linked_nodes.clustering.create_publisher(load_message_class(CLOUD), GROUND_POINTS, RELIABLE)
     recorder._discover()  # with a second publisher, all messages come by DDS
     assert not recorder.link_by_topic and recorder.subscription_by_topic
-    graph.clustering.destroy_publisher(other)
+    linked_nodes.clustering.destroy_publisher(other)
     recorder._discover()
     assert recorder.link_by_topic and not recorder.subscription_by_topic
-    graph.ground.on_points(make_cloud(10**18 + 1))
+    linked_nodes.ground.on_points(make_cloud(10**18 + 1))
     recorder.close()
     recorder.destroy_node()
     with Bag(tmp_path / "bag") as bag:

@@ -9,8 +9,17 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from detection_samples import lively, tiny
-from detector_node import FUSED_NODE, POINTNET_NODE, POINTPILLARS_NODE, REMAP, assert_equal, message, received, small_v4
+from detection_samples import make_random_network, make_tiny_config
+from detector_node import (
+    FUSED_NODE,
+    POINTNET_NODE,
+    POINTPILLARS_NODE,
+    REMAP,
+    assert_equal,
+    find_received,
+    make_scan_message,
+    small_v4,
+)
 from rcl_interfaces.srv import DescribeParameters
 from ros_samples import BAD, CLOUD
 
@@ -63,33 +72,40 @@ def weights(tested, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def segmented(tested):
-    """Ground and clusters of message(1) from the nodes before the detector."""
+def segmented_cloud(tested):
+    """Ground and clusters of make_scan_message(1) from the nodes before the detector."""
     params = with_values(PipelineParams(), read_config(tested.stages, PipelineParams()))
-    return segment_cloud(to_point_cloud(message(1), 0.0)[0], None, params)
+    return segment_cloud(to_point_cloud(make_scan_message(1), 0.0)[0], None, params)
 
 
-def test_detections_equal_those_of_offline_detector(tested, found, talker, peer, weights, segmented):
+def test_detections_equal_those_of_offline_detector(tested, graph_detections, talker, peer, weights, segmented_cloud):
     """One cloud passes the complete graph; one without columns is sent directly to the detector."""
     points = peer.listen(tested.between, CLOUD)
     times = {step: peer.listen(f"/{tested.node}/debug/{step}_ms", "std_msgs/msg/Float64") for step in tested.steps}
     peer.wait_for_diagnostics(tested.node, "waiting for input")
-    scan = to_point_cloud(message(1), 0.0)[0]
+    scan = to_point_cloud(make_scan_message(1), 0.0)[0]
     if len(tested.graph) > 1:
-        peer.send(peer.advertise(POINTS, CLOUD), message(1), lambda: points and received(found, 1), "detections")
-        assert segmented.ground.any() and segmented.cluster_ids.max() >= 2
-        indices = np.arange(len(scan))
-        np.testing.assert_array_equal(read_column(points[-1], "cluster_id", indices), segmented.cluster_ids)
-        np.testing.assert_array_equal(read_column(points[-1], "ground", indices) > 0, segmented.ground)
-        assert_equal(
-            received(found, 1),
-            tested.offline(weights, message(1), ground=segmented.ground, cluster_ids=segmented.cluster_ids),
+        peer.send(
+            peer.advertise(POINTS, CLOUD),
+            make_scan_message(1),
+            lambda: points and find_received(graph_detections, 1),
+            "detections",
         )
-        assert received(found, 1).frame_id == "lidar"
+        assert segmented_cloud.ground.any() and segmented_cloud.cluster_ids.max() >= 2
+        indices = np.arange(len(scan))
+        np.testing.assert_array_equal(read_column(points[-1], "cluster_id", indices), segmented_cloud.cluster_ids)
+        np.testing.assert_array_equal(read_column(points[-1], "ground", indices) > 0, segmented_cloud.ground)
+        assert_equal(
+            find_received(graph_detections, 1),
+            tested.offline(
+                weights, make_scan_message(1), ground=segmented_cloud.ground, cluster_ids=segmented_cloud.cluster_ids
+            ),
+        )
+        assert find_received(graph_detections, 1).frame_id == "lidar"
 
-    plain = tested.offline(weights, message(2))
-    peer.send(talker, message(2), lambda: received(found, 2), "detections of a plain cloud")
-    objects = received(found, 2)
+    plain = tested.offline(weights, make_scan_message(2))
+    peer.send(talker, make_scan_message(2), lambda: find_received(graph_detections, 2), "detections of a plain cloud")
+    objects = find_received(graph_detections, 2)
     assert_equal(objects, plain)
     for i, extra in enumerate(objects.extras if plain.sources else []):
         assert extra["sources"] == {
@@ -103,34 +119,36 @@ def test_detections_equal_those_of_offline_detector(tested, found, talker, peer,
     assert network.startswith(tested.title) and (tested is not FUSED_NODE or "PointNet" in network)
 
 
-def test_columns_of_the_cloud_replace_own_segmentation(tested, found, talker, peer, weights):
-    scan = to_point_cloud(message(1), 0.0)[0]
+def test_columns_of_the_cloud_replace_own_segmentation(tested, graph_detections, talker, peer, weights):
+    scan = to_point_cloud(make_scan_message(1), 0.0)[0]
     no_ground = np.zeros(len(scan), np.uint8)
     ids = cluster_obstacles(scan.xyz, no_ground > 0, tested.params.clustering)
     peer.send(
         talker,
-        message(3, ground=no_ground, cluster_id=ids.astype(np.uint32)),
-        lambda: received(found, 3),
+        make_scan_message(3, ground=no_ground, cluster_id=ids.astype(np.uint32)),
+        lambda: find_received(graph_detections, 3),
         "detections of a cloud with columns",
     )
-    expected = tested.offline(weights, message(3), ground=no_ground > 0, cluster_ids=ids)
-    assert_equal(received(found, 3), expected)
-    plain = tested.offline(weights, message(2))
+    expected = tested.offline(weights, make_scan_message(3), ground=no_ground > 0, cluster_ids=ids)
+    assert_equal(find_received(graph_detections, 3), expected)
+    plain = tested.offline(weights, make_scan_message(2))
     assert not (np.array_equal(expected.boxes, plain.boxes) and np.array_equal(expected.scores, plain.scores))
 
 
-def test_bad_clouds_are_reported_and_the_node_continues(tested, talker, found, shared_processes, peer, weights):
+def test_bad_clouds_are_reported_and_the_node_continues(
+    tested, talker, graph_detections, shared_processes, peer, weights
+):
     bad = {**{name: bad for name, bad in BAD.items() if name != "one point"}, **tested.bad_clouds()}
     for name, (msg, words) in bad.items():
         peer.diagnostics.clear()
         peer.send(talker, msg, lambda w=words: w in peer.get_message(tested.node), f"'{words}': {name}")
-    peer.send(talker, message(7), lambda: received(found, 7), "detections of a good cloud")
-    assert_equal(received(found, 7), tested.offline(weights, message(7)))
+    peer.send(talker, make_scan_message(7), lambda: find_received(graph_detections, 7), "detections of a good cloud")
+    assert_equal(find_received(graph_detections, 7), tested.offline(weights, make_scan_message(7)))
     log = shared_processes.read_log(tested.node)
     assert "Traceback" not in log and "Warning" not in log
 
 
-def test_only_thresholds_can_change_at_run_time(tested, talker, found, peer):
+def test_only_thresholds_can_change_at_run_time(tested, talker, graph_detections, peer):
     network = tested.network
     for name, value, words in [
         (f"{network}.weights", "other.safetensors", "read-only"),
@@ -149,8 +167,10 @@ def test_only_thresholds_can_change_at_run_time(tested, talker, found, peer):
 
     names = [k for k in tested.values(Path("w")) if k.startswith(f"{network}.scores.")]
     with peer.override_parameters(f"/{tested.node}", dict.fromkeys(names, 1.0)):
-        peer.send(talker, message(12), lambda: received(found, 12) is not None, "no detections")
-        assert len(received(found, 12)) == 0
+        peer.send(
+            talker, make_scan_message(12), lambda: find_received(graph_detections, 12) is not None, "no detections"
+        )
+        assert len(find_received(graph_detections, 12)) == 0
         peer.wait(lambda: "threshold" in peer.get_message(tested.node), "the reason")
         if tested is not FUSED_NODE:
             peer.wait(lambda: "Car 0." in (peer.get_value(tested.node, "best scores") or ""), "the scores")
@@ -158,26 +178,26 @@ def test_only_thresholds_can_change_at_run_time(tested, talker, found, peer):
         with peer.override_parameters(f"/{tested.node}", {"ground.sensor_pose.height": 1.2}):
             peer.send(
                 talker,
-                message(13),
+                make_scan_message(13),
                 lambda: "ground.sensor_pose.height is 1.2" in peer.get_message(tested.node),
                 "the wrong height",
             )
 
 
-def other_version(folder):
+def use_other_version(folder):
     path = folder / "v0.safetensors"
-    save_checkpoint(path, lively(tiny("v0")), Header(tiny("v0")))
+    save_checkpoint(path, make_random_network(make_tiny_config("v0")), Header(make_tiny_config("v0")))
     return {"pointpillars.weights": str(path), "pointpillars.version": "auto"}
 
 
-def nan_weights(folder):
-    network = lively(tiny("v0"))
+def use_nan_weights(folder):
+    network = make_random_network(make_tiny_config("v0"))
     network.head.scores.bias.fill_(np.nan)
-    save_checkpoint(folder / "nan.safetensors", network, Header(tiny("v0")))
+    save_checkpoint(folder / "nan.safetensors", network, Header(make_tiny_config("v0")))
     return {"pointpillars.weights": str(folder / "nan.safetensors")}
 
 
-def unshipped_version():
+def find_unshipped_version():
     """Version and size of a PointPillars whose weights are not shipped, or None."""
     from lidar_perception.detectors.weights_file import POINTPILLARS_WEIGHTS
 
@@ -192,22 +212,22 @@ def unshipped_version():
     )
 
 
-UNSHIPPED = unshipped_version()
+UNSHIPPED = find_unshipped_version()
 MISSING = "checkpoint not found: /nowhere.safetensors"
 UNUSABLE = {  # by detector: function that makes parameters, level, words; more in test_weights.py
     POINTPILLARS_NODE.node: [
         (lambda folder: {"pointpillars.weights": "/nowhere.safetensors"}, 2, MISSING),
         (
             lambda folder: {
-                **other_version(folder),
+                **use_other_version(folder),
                 "pointpillars.device": "cuda:99",
                 "pointpillars.cpu_fallback": False,
             },
             2,
             "'cuda:99' is not available",
         ),
-        (lambda folder: {**other_version(folder), "pointpillars.device": "cuda:99"}, 1, "falling back to the CPU"),
-        (nan_weights, 1, "scores are NaN"),
+        (lambda folder: {**use_other_version(folder), "pointpillars.device": "cuda:99"}, 1, "falling back to the CPU"),
+        (use_nan_weights, 1, "scores are NaN"),
         *[
             (
                 lambda folder, v=version, s=size: {"pointpillars.version": v, "pointpillars.size": s},
@@ -234,7 +254,7 @@ def test_unusable_weights_are_reported_in_diagnostics(tested, shared_processes, 
     talker = peer.advertise("/in", CLOUD)
     for i, (_, level, words) in enumerate(cases):
         node, log = f"bad{i}/{tested.node}", f"bad{i}.{tested.node}"
-        peer.send(talker, message(1), lambda n=node, w=words: w in peer.get_message(n), words)
+        peer.send(talker, make_scan_message(1), lambda n=node, w=words: w in peer.get_message(n), words)
         assert ord(peer.diagnostics[node].level) == level
         peer.diagnostics.clear()
         peer.wait(lambda n=node, w=words: w in peer.get_message(n), "the diagnostic again")
@@ -245,7 +265,7 @@ def test_unusable_weights_are_reported_in_diagnostics(tested, shared_processes, 
             assert "libtorch" not in maps.read_text()  # loading torch takes seconds and 200 MB
 
 
-def test_node_runs_own_detector_class(start, tmp_path, monkeypatch):
+def test_node_runs_own_detector_class(start_node, tmp_path, monkeypatch):
     (tmp_path / "own_fused.py").write_text("""
 import lidar_perception as lp
 
@@ -261,10 +281,10 @@ class Posts:
     from visualization_msgs.msg import MarkerArray
 
     monkeypatch.syspath_prepend(tmp_path)
-    node = start(
+    node = start_node(
         FusedNode, **{"fused.weights": "own_fused:Posts", "ground.sensor_pose.height": 0.5, "fused.warm_up": False}
     )
-    node.on_points(message(1))
+    node.on_points(make_scan_message(1))
     found = from_marker_array(deserialize_message(node.sent["detections"][-1], MarkerArray))
     assert found.labels == ["Pedestrian"] and found.boxes[0, 5] == pytest.approx(0.5)
     assert node.diagnostics.counts["network"] == "own_fused:Posts, Pedestrian"
@@ -283,11 +303,11 @@ def test_help_lists_parameters(node, words, capsys):
 
 
 @pytest.mark.parametrize("range", ["ahead", "around"])
-def test_expert_nodes_segment_the_points_of_the_detector(start, range):
+def test_expert_nodes_segment_the_points_of_the_detector(start_node, range):
     """The ground equals that of the detector, and the published parts contain all points of the cloud."""
-    node = start(GroundSegmentation, range=range, **{"ground.method": "patchwork"})
+    node = start_node(GroundSegmentation, range=range, **{"ground.method": "patchwork"})
     assert read_header(find_fused_weights(FusedParams()), NetworkConfig).config.low == AHEAD["low"]
-    cloud = message(1)
+    cloud = make_scan_message(1)
     node.nonground.publisher.get_subscription_count = lambda: 1
     node.on_points(cloud)
     got, rest = (decode(node.sent[name][0], CLOUD) for name in ("points", "nonground"))

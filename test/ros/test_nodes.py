@@ -92,9 +92,9 @@ def test_parameters_are_those_of_the_dataclass(perception, shared_peer):
 
 
 @pytest.mark.parametrize("kind", [GroundSegmentation, Perception])
-def test_every_parameter_is_readable_and_lists_may_be_empty(start, kind):
+def test_every_parameter_is_readable_and_lists_may_be_empty(start_node, kind):
     """`ros2 param dump` reads all parameters; `ros2 param set` sends [] as a list of booleans."""
-    node = start(kind)
+    node = start_node(kind)
     declared = list_parameter_names(node)
     values = node.get_parameters(declared)
     assert not [p.name for p in values if p.value is None or p.type_ == Parameter.Type.NOT_SET]
@@ -110,9 +110,9 @@ def test_every_parameter_is_readable_and_lists_may_be_empty(start, kind):
         assert list(node.get_parameter(p.name).value) == []
 
 
-def test_problem_with_changing_numbers_is_logged_once(start, monkeypatch):
+def test_problem_with_changing_numbers_is_logged_once(start_node, monkeypatch):
     """The end of the problem is logged as well, so the log ends with the current state."""
-    node, lines = start(GroundSegmentation), []
+    node, lines = start_node(GroundSegmentation), []
     monkeypatch.setattr(node.diagnostics, "_log", lambda level, message: lines.append((level, message)))
     for i in range(100):
         node.diagnostics.report(WARN, f"intensity goes up to {i / 7:.2g} where 1 is expected")
@@ -158,9 +158,9 @@ for given in sys.argv[1:]:
         assert words in fatal and "[left.front]: " in fatal and "Traceback" not in said
 
 
-def test_unknown_parameter_is_reported(start):
+def test_unknown_parameter_is_reported(start_node):
     """The message of rclpy would be: undeclared parameter(s): []."""
-    node = start(GroundSegmentation)
+    node = start_node(GroundSegmentation)
     for name, words in (
         ("input.queu", "no parameter 'input.queu'; did you mean 'input.queue'?"),
         ("zzz", "/ground_segmentation has no parameter 'zzz'$"),

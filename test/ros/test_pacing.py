@@ -18,11 +18,11 @@ from lidar_perception.runs.threads import PASSIVE_WAITING
 from lidar_perception.types import InputError
 
 
-def stamp(number):
+def make_stamp(number):
     return number.to_bytes(8, "little")
 
 
-def pace_of(topics, ahead, timeout=10.0):
+def make_pace(topics, ahead, timeout=10.0):
     return pacing.Pace(SimpleNamespace(create_subscription=lambda *_, **__: None), topics, ahead, timeout)
 
 
@@ -31,31 +31,31 @@ def test_player_limits_clouds_in_flight():
     rng = np.random.default_rng(0)
     for _ in range(100):
         topics, ahead = ["/a", "/b"][: rng.integers(1, 3)], int(rng.integers(1, 4))
-        pace, answers = pace_of(topics, ahead), 0
+        pace, answers = make_pace(topics, ahead), 0
 
         def serve(pace=pace, topics=topics):
             nonlocal answers
             number, topic = int(rng.integers(0, 40)), str(rng.choice(topics))
             before = len(pace.waiting)
-            pace.add_answer(stamp(number), topic)
+            pace.add_answer(make_stamp(number), topic)
             assert len(pace.waiting) <= before
             answers += 1
 
         for number in range(40):
             pace.wait_for_room(serve, lambda: False)
             assert len(pace.waiting) < ahead
-            pace.add_cloud(b"\0" * 4 + stamp(number))
-            assert list(pace.waiting)[-1] == stamp(number)
+            pace.add_cloud(b"\0" * 4 + make_stamp(number))
+            assert list(pace.waiting)[-1] == make_stamp(number)
         assert answers and pace.unanswered <= 40 * len(topics)
 
 
 def test_answer_marks_earlier_clouds_as_missed():
-    pace = pace_of(["/a"], 2)
+    pace = make_pace(["/a"], 2)
     for number in range(3):
-        pace.add_cloud(b"\0" * 4 + stamp(number))
-    pace.add_answer(stamp(0), "/a")
-    assert pace.unanswered == 0 and list(pace.waiting) == [stamp(1), stamp(2)]
-    pace.add_answer(stamp(2), "/a")
+        pace.add_cloud(b"\0" * 4 + make_stamp(number))
+    pace.add_answer(make_stamp(0), "/a")
+    assert pace.unanswered == 0 and list(pace.waiting) == [make_stamp(1), make_stamp(2)]
+    pace.add_answer(make_stamp(2), "/a")
     assert pace.unanswered == 1 and not pace.waiting
 
 
@@ -67,10 +67,10 @@ def test_player_waits_full_timeout_only_once(monkeypatch):
         nonlocal now
         now += 0.25
 
-    pace = pace_of(["/a"], 1, timeout=8.0)
+    pace = make_pace(["/a"], 1, timeout=8.0)
     for number in range(5):
         pace.wait_for_room(serve, lambda: False)
-        pace.add_cloud(b"\0" * 4 + stamp(number))
+        pace.add_cloud(b"\0" * 4 + make_stamp(number))
     assert pace.unanswered == 4 and 8 + 3 < pace.held <= 8 + 3 + 4 * 0.25
     held = pace.held
     pace.wait_for_answers(serve, lambda: False)

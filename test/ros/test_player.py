@@ -45,7 +45,7 @@ def text_bag(tmp_path_factory):
     return path
 
 
-def texts(messages):
+def get_texts(messages):
     return [m.data for m in messages]
 
 
@@ -79,8 +79,8 @@ def test_offset_duration_topics_and_remapping_take_effect(processes, peer, text_
         processes, text_bag, start_offset=0.5, duration=1.0, remap=["/text:=renamed"], wait_for=["/renamed"], rate=10.0
     )
     peer.wait(lambda: processes.has_ended("bag_player") and len(heard) >= 10 and note, "ten messages")
-    assert texts(heard) == [str(i) for i in range(5, 15)]
-    assert texts(note) == ["latched"]  # although the offset skips it
+    assert get_texts(heard) == [str(i) for i in range(5, 15)]
+    assert get_texts(note) == ["latched"]  # although the offset skips it
     processes.check("bag_player")
 
 
@@ -95,7 +95,7 @@ def test_latched_topic_reaches_a_late_subscriber(processes, peer, text_bag):
     peer.wait(lambda: note, "the latched message")
 
 
-def test_static_transforms_accumulate_others_keep_last(monkeypatch, start, tmp_path):
+def test_static_transforms_accumulate_others_keep_last(monkeypatch, start_node, tmp_path):
     """Every publisher of static transforms sends its own, once."""
     from lidar_perception.nodes.replay import bag_player
 
@@ -108,7 +108,7 @@ def test_static_transforms_accumulate_others_keep_last(monkeypatch, start, tmp_p
             bag.write("/info", START + i, make_bag_message(INFO, width=i))
         bag.add_topic("/text", TEXT, SENSOR_QOS)
         bag.write("/text", START + STEP, make_bag_message(TEXT))
-    player = start(bag_player.BagPlayer, bag=str(tmp_path / "bag"), start_offset=0.05)
+    player = start_node(bag_player.BagPlayer, bag=str(tmp_path / "bag"), start_offset=0.05)
     player._publish_latched()
     assert [decode(d, TEXT).data for d in player.sent["tf_static"]] == [*map(str, range(20))]
     assert [decode(d, INFO).width for d in player.sent["info"]] == [19]
@@ -116,7 +116,7 @@ def test_static_transforms_accumulate_others_keep_last(monkeypatch, start, tmp_p
     assert depths == {"/tf_static": 100, "/info": 10, "/text": 10}  # for late subscribers, too
 
 
-def test_livox_and_compressed_clouds_are_played_as_point_clouds(start, tmp_path):
+def test_livox_and_compressed_clouds_are_played_as_point_clouds(start_node, tmp_path):
     """A cloud that cannot be converted is skipped; all other messages are played."""
     from lidar_perception.nodes.replay.bag_player import BagPlayer
 
@@ -132,7 +132,7 @@ def test_livox_and_compressed_clouds_are_played_as_point_clouds(start, tmp_path)
             bag.add_topic(topic, kind)
             for message in messages:
                 bag.write(topic, START, message)
-    player = start(BagPlayer, bag=str(tmp_path / "bag"))
+    player = start_node(BagPlayer, bag=str(tmp_path / "bag"))
     assert {p.topic_name: p.msg_type.__name__ for p in player.publishers_by_topic.values()} == {
         "/livox": "PointCloud2",
         "/zlib": "PointCloud2",
@@ -144,10 +144,10 @@ def test_livox_and_compressed_clouds_are_played_as_point_clouds(start, tmp_path)
     sent = {topic: [decode(d, TEXT if topic == "text" else CLOUD) for d in data] for topic, data in player.sent.items()}
     assert [np.array_equal(to_array(cloud)["x"], points["x"]) for cloud in sent["livox"]] == [True, True]
     assert [len(to_array(cloud)) for cloud in sent["zlib"]] == [3]
-    assert (sent["draco"], texts(sent["text"]), player.diagnostics.counts["left_out"]) == ([], ["text"], 2)
+    assert (sent["draco"], get_texts(sent["text"]), player.diagnostics.counts["left_out"]) == ([], ["text"], 2)
 
 
-def test_bag_with_wrong_metadata_plays_with_a_warning(start, text_bag, tmp_path, capfd):
+def test_bag_with_wrong_metadata_plays_with_a_warning(start_node, text_bag, tmp_path, capfd):
     from lidar_perception.nodes.replay.bag_player import BagPlayer
 
     shutil.copytree(text_bag, tmp_path / "bag")
@@ -156,7 +156,7 @@ def test_bag_with_wrong_metadata_plays_with_a_warning(start, text_bag, tmp_path,
         starting_time={"nanoseconds_since_epoch": START + 10 * STEP}, duration={"nanoseconds": 5}, storage_identifier=""
     )
     (tmp_path / "bag/metadata.yaml").write_text(yaml.safe_dump(metadata))
-    player = start(BagPlayer, bag=str(tmp_path / "bag"), rate=100.0)
+    player = start_node(BagPlayer, bag=str(tmp_path / "bag"), rate=100.0)
     player.serve = lambda timeout_sec: None
     player._play_once()
     assert len(player.sent["text"]) == 20
@@ -187,12 +187,12 @@ def test_pause_step_resume_and_rate_take_effect(processes, peer, text_bag):
     for expected in (["0"], ["0", "1"], ["0", "1", "2"]):
         assert peer.call("/bag_player/step", Trigger, request).success
         peer.wait(lambda n=len(expected): len(heard) >= n, "the stepped message")
-        assert texts(heard) == expected
+        assert get_texts(heard) == expected
     assert peer.call("/bag_player/resume", Trigger, request).success
     assert not peer.call("/bag_player/step", Trigger, request).success  # only while paused
     peer.set_parameter("/bag_player", "rate", 5.0)
     peer.wait(lambda: len(heard) == 20, "the rest")
-    assert texts(heard) == [str(i) for i in range(20)]
+    assert get_texts(heard) == [str(i) for i in range(20)]
 
 
 def test_bag_time_follows_the_rate_and_stops_while_paused(monkeypatch):
@@ -236,7 +236,7 @@ def test_clock_follows_a_looped_bag(processes, peer, text_bag):
     heard, clock = peer.listen("/text", TEXT), peer.listen("/clock", "rosgraph_msgs/msg/Clock")
     start(processes, text_bag, loop=True, rate=3.0, clock_hz=200.0)
     peer.wait(lambda: len(heard) > 45, "two and a half rounds")
-    numbers = np.array(texts(heard), int)
+    numbers = np.array(get_texts(heard), int)
     again = np.flatnonzero(np.diff(numbers) < 0)  # also a busy subscriber notices every round
     assert 2 <= len(again) <= 3 and (np.diff(numbers) != 0).all()
     assert (numbers[again] > 14).all() and (numbers[again + 1] < 5).all()
@@ -300,7 +300,7 @@ BAD = {
 
 
 @pytest.fixture(scope="module")
-def refused(shared_processes, text_bag, drive_bag, tmp_path_factory):
+def failed_players(shared_processes, text_bag, drive_bag, tmp_path_factory):
     """Start one player per case in its own namespace; return the players and the truncated bag."""
     cut = tmp_path_factory.mktemp("cut") / "texts"
     shutil.copytree(text_bag, cut)
@@ -313,11 +313,11 @@ def refused(shared_processes, text_bag, drive_bag, tmp_path_factory):
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_unplayable_bag_logs_one_line_and_exits_with_2(refused, shared_processes, case):
+def test_unplayable_bag_logs_one_line_and_exits_with_2(failed_players, shared_processes, case):
     assert shared_processes.running[f"{case}.bag_player"].wait(timeout=60) == 2
     log = shared_processes.read_log(f"{case}.bag_player")
     assert BAD[case][1] in log.splitlines()[-1] and "Traceback" not in log
-    assert case != "truncated" or str(refused) in log
+    assert case != "truncated" or str(failed_players) in log
 
 
 def test_recorder_writes_the_played_messages(processes, peer, text_bag, tmp_path):

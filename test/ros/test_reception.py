@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from rclpy.executors import SingleThreadedExecutor
-from ros_samples import CLOUD, MARKERS, cloud
+from ros_samples import CLOUD, MARKERS, make_ros_cloud
 
 from lidar_perception.nodes import reception as reception_module
 from lidar_perception.nodes.arrivals import RATE_INTERVALS
@@ -37,7 +37,7 @@ TEXT = "std_msgs/msg/String"
 
 
 @contextmanager
-def driver(peer, reliability, count, points=KITTI, first=1, hz=10):
+def start_driver(peer, reliability, count, points=KITTI, first=1, hz=10):
     """Run a process that publishes clouds, without a Fast DDS profile."""
     environment = {k: v for k, v in os.environ.items() if k not in PROFILE_VARIABLES}
     process = subprocess.Popen(
@@ -80,7 +80,7 @@ def test_clouds_are_received_with_any_reliability(processes, peer):
     processes.start(
         NODE, {"~/input/points": "/in"}, {"input.error_after": 1, "input.stale_after": 3, "input.max_lost": 0}
     )
-    with driver(peer, "reliable", 30):
+    with start_driver(peer, "reliable", 30):
         peer.wait(lambda: done() == 30, "all clouds of a reliable driver")
     assert value("lost") == 0 and peer.get_value(NODE, "reliability") == "reliable"
     assert peer.diagnostics[NODE].hardware_id == "driver_lidar"
@@ -88,7 +88,7 @@ def test_clouds_are_received_with_any_reliability(processes, peer):
     peer.wait(lambda: level() == STALE and "more than 3 s" in peer.get_message(NODE), "it is stale")
 
     before = value("frames")
-    with driver(peer, "best_effort", 30, first=100):
+    with start_driver(peer, "best_effort", 30, first=100):
         peer.wait(lambda: value("last_stamp_ns") >= 120 * 10**9 or value("lost"), "clouds")
         assert peer.get_value(NODE, "reliability") == "best effort"
     peer.wait(lambda: "no cloud" in peer.get_message(NODE), "the end")
@@ -102,7 +102,7 @@ def test_clouds_are_received_with_any_reliability(processes, peer):
     peer.set_parameter(f"/{NODE}", "input.stale_after", 1000)
     peer.wait(lambda: "no cloud" not in peer.get_message(NODE), "no limit")
 
-    with driver(peer, "reliable", 30, points=2000, first=200):  # some are lost while the node reconnects
+    with start_driver(peer, "reliable", 30, points=2000, first=200):  # some are lost while the node reconnects
         peer.wait(lambda: value("last_stamp_ns") == 229 * 10**9, "a reliable one again")
         assert peer.get_value(NODE, "reliability") == "reliable"
     processes.check()
@@ -113,11 +113,11 @@ def test_newest_cloud_is_processed_and_dropped_ones_counted(processes, peer):
     processes.start(NODE, {"~/input/points": "/in"}, {"ground.method": "patchwork"})
     talker, rng = peer.advertise("/in", CLOUD), np.random.default_rng(0)
     large, *small = (
-        encode(cloud(rng.uniform(-50, 50, (n, 3)) * [1, 1, 0.05], stamp))
+        encode(make_ros_cloud(rng.uniform(-50, 50, (n, 3)) * [1, 1, 0.05], stamp))
         for stamp, n in enumerate([1_000_000, *[2000] * 40], start=2)
     )
     peer.wait(talker.get_subscription_count, "the node")
-    talker.publish(encode(cloud(np.ones((9, 3)), 1)))
+    talker.publish(encode(make_ros_cloud(np.ones((9, 3)), 1)))
     peer.wait(lambda: peer.get_value(NODE, "frames") == "1", "the first cloud")
     for data in (large, *small):
         talker.publish(data)
@@ -154,7 +154,7 @@ def test_sensors_in_two_namespaces_are_separate(two_sensors, shared_peer):
     street = np.random.default_rng(0).uniform(-20, 20, (5000, 3)) * [1, 1, 1e-3] - [0, 0, 1.73]
     for i, (side, talker) in enumerate(talkers.items()):
         stamp = 5 * 10**9 * (i + 1)
-        peer.send(talker, cloud(street, stamp), lambda s=side: found[s], f"the result of {side}")
+        peer.send(talker, make_ros_cloud(street, stamp), lambda s=side: found[s], f"the result of {side}")
         assert {to_ns(m.markers[0].header.stamp) for m in found[side]} == {stamp}
         assert found[side][0].markers[0].lifetime.sec == 2  # so that boxes of a dead node disappear
     own = {f"{side}/{node}": (side, f"{side}/lidar") for side in SIDES for node in CANDIDATES_GRAPH}
@@ -175,7 +175,7 @@ def test_two_nodes_with_the_same_name_are_reported(two_sensors, shared_peer, pro
     shared_peer.wait_for_diagnostics("left/clustering", "another node is also called /left/clustering", WARN)
 
 
-def infos(numbers, period=10**8):
+def make_infos(numbers, period=10**8):
     return [{"publication_sequence_number": n, "source_timestamp": n * period} for n in numbers]
 
 
@@ -188,7 +188,7 @@ def test_every_cloud_is_processed_or_counted_as_dropped():
             steps = rng.choice([1, 1, 1, 2, 9], rng.integers(1, 7))
             numbers = number + np.cumsum(steps)
             number = int(numbers[-1])
-            arrivals.add(infos(numbers.tolist()), len(numbers) - 1)
+            arrivals.add(make_infos(numbers.tolist()), len(numbers) - 1)
             taken += 1
             sizes.append(steps[0] - 1)
         first = sizes[0]  # the number before the first is unknown
@@ -200,28 +200,28 @@ def test_every_cloud_is_processed_or_counted_as_dropped():
 
 def test_cloud_dropped_from_full_queue_is_not_counted_lost():
     arrivals = Arrivals(5)
-    arrivals.add(infos([1]), 0)
-    arrivals.add(infos([8, 9, 10, 11, 12]), 4)
+    arrivals.add(make_infos([1]), 0)
+    arrivals.add(make_infos([8, 9, 10, 11, 12]), 4)
     assert (arrivals.lost, arrivals.dropped, arrivals.sent) == (0, 10, 12)
-    arrivals.add(infos([15, 16]), 1)
+    arrivals.add(make_infos([15, 16]), 1)
     assert (arrivals.lost, arrivals.dropped, arrivals.sent) == (2, 11, 16)
 
 
 def test_restarted_or_second_driver_loses_no_cloud():
     arrivals = Arrivals(5)
     for number in (7, 8, 1, 2):
-        arrivals.add(infos([number]), 0)
-    arrivals.add(infos([90]), 0, one_publisher=False)
-    arrivals.add(infos([99]), 0)  # the first publisher again, alone
-    arrivals.add(infos([101]), 0)
+        arrivals.add(make_infos([number]), 0)
+    arrivals.add(make_infos([90]), 0, one_publisher=False)
+    arrivals.add(make_infos([99]), 0)  # the first publisher again, alone
+    arrivals.add(make_infos([101]), 0)
     assert (arrivals.lost, arrivals.dropped, arrivals.sent) == (1, 0, 8)
 
 
 def test_lower_rate_of_a_sensor_is_measured_from_its_stamps():
     arrivals = Arrivals(5)
     for number in range(1, 30):
-        arrivals.add(infos([number]), 0)
-    for info in infos(range(30, 30 + RATE_INTERVALS)):
+        arrivals.add(make_infos([number]), 0)
+    for info in make_infos(range(30, 30 + RATE_INTERVALS)):
         info["source_timestamp"] = 29 * 10**8 + (info["publication_sequence_number"] - 29) * 10**9
         arrivals.add([info], 0)
     assert arrivals.expected_rate == pytest.approx(10) and arrivals.measure_rate() == pytest.approx(1)
@@ -239,8 +239,8 @@ OVERRIDE = f"qos_overrides./{NODE}/input/points.subscription.reliability"
         ({"input.reliability": "reliable"}, "input.reliability to auto"),
     ],
 )
-def test_incompatible_publisher_is_reported_with_remedy(start, monkeypatch, values, remedy):
-    (reception,) = start(GroundSegmentation, **values).inputs.receptions
+def test_incompatible_publisher_is_reported_with_remedy(start_node, monkeypatch, values, remedy):
+    (reception,) = start_node(GroundSegmentation, **values).inputs.receptions
     for offered in ({RELIABLE}, {BEST_EFFORT}, {RELIABLE, BEST_EFFORT}):
         there = [
             SimpleNamespace(
@@ -257,14 +257,14 @@ def test_incompatible_publisher_is_reported_with_remedy(start, monkeypatch, valu
         assert bool(said) == (remedy != "" and BEST_EFFORT in offered)
 
 
-def test_middleware_queue_has_the_length_of_the_input_queue(start):
+def test_middleware_queue_has_the_length_of_the_input_queue(start_node):
     for queue, depth in (1, 5), (20, 20):
-        (reception,) = start(GroundSegmentation, **{"input.queue": queue}).inputs.receptions
+        (reception,) = start_node(GroundSegmentation, **{"input.queue": queue}).inputs.receptions
         assert reception.subscription.qos_profile.depth == reception.arrivals.depth == depth
 
 
-def test_publisher_without_latching_is_reported_with_remedy(peer, start):
-    node = start(GroundSegmentation)
+def test_publisher_without_latching_is_reported_with_remedy(peer, start_node):
+    node = start_node(GroundSegmentation)
     node.inputs.subscribe("/static", TEXT, lambda _: None, LATCHED, private=False)
     peer.advertise("/static", TEXT, RELIABLE_QOS)
     executor = SingleThreadedExecutor(context=node.context)
@@ -272,8 +272,8 @@ def test_publisher_without_latching_is_reported_with_remedy(peer, start):
     peer.wait(lambda: [executor.spin_once(0.0), "transient local" in node.diagnostics.state[1]][1], "the remedy")
 
 
-def test_lost_clouds_are_attributed_to_an_ended_driver(start, monkeypatch):
-    (reception,) = start(GroundSegmentation, **{"input.max_lost": 0}).inputs.receptions
+def test_lost_clouds_are_attributed_to_an_ended_driver(start_node, monkeypatch):
+    (reception,) = start_node(GroundSegmentation, **{"input.max_lost": 0}).inputs.receptions
     driver = SimpleNamespace(
         node_namespace="/", node_name="driver", qos_profile=SimpleNamespace(reliability=BEST_EFFORT)
     )
@@ -311,7 +311,7 @@ def test_lost_clouds_are_attributed_to_an_ended_driver(start, monkeypatch):
     ],
 )
 def test_reception_hint_depends_on_publisher(monkeypatch, topic, what, publisher, silent, slow):
-    late = Late(monkeypatch, lambda stamp: 0.0, rate=10.0)
+    late = LatePoses(monkeypatch, lambda stamp: 0.0, rate=10.0)
     late.reception.topic, late.reception.what = topic, what
     late.reception.last_publishers = [SimpleNamespace(node_namespace="/", node_name=publisher)] * bool(publisher)
     late.reception.last_time, late.now = 1.0, 4.0
@@ -323,7 +323,7 @@ def test_reception_hint_depends_on_publisher(monkeypatch, topic, what, publisher
     assert slow in said and ("sensor" in said) == (topic == "/velodyne_points")
 
 
-class Late:
+class LatePoses:
     """Reception of clouds at 10 Hz in simulated time with poses that arrive lag(stamp) seconds later. answered:
     (stamp, True if the cloud had its pose) of each delivered cloud.
     """
@@ -372,7 +372,7 @@ class Late:
     ],
 )
 def test_slow_sensor_is_not_reported_as_silent(monkeypatch, given, learned, error, stale, lifetime):
-    late = Late(monkeypatch, lambda stamp: 0.0, rate=given)
+    late = LatePoses(monkeypatch, lambda stamp: 0.0, rate=given)
     late.reception.arrivals.expected_rate, late.reception.last_time = learned, 1.0
     for late.now, kinds in (
         (1 + error, []),
@@ -391,7 +391,7 @@ def test_slow_sensor_is_not_reported_as_silent(monkeypatch, given, learned, erro
 
 @pytest.mark.parametrize("lag, rate", [(0.0, 10), (0.05, 10), (0.13, 10), (0.25, 4), (0.6, 1.6)])
 def test_clouds_get_their_own_late_poses(monkeypatch, lag, rate):
-    late = Late(monkeypatch, lambda stamp: lag)
+    late = LatePoses(monkeypatch, lambda stamp: lag)
     late.run(30.0)
     assert all(known for _, known in late.answered)
     stamps = [stamp for stamp, _ in late.answered]
@@ -399,7 +399,7 @@ def test_clouds_get_their_own_late_poses(monkeypatch, lag, rate):
 
 
 def test_clouds_without_poses_are_used_until_poses_return(monkeypatch):
-    late = Late(monkeypatch, lambda stamp: 100.0 if 5 < stamp < 40 else 0.15, max_wait=2.0)
+    late = LatePoses(monkeypatch, lambda stamp: 100.0 if 5 < stamp < 40 else 0.15, max_wait=2.0)
     late.run(60.0)
     assert not [s for s, _ in late.answered if 5.2 < s < 6.0]  # it waits for max_wait
     without = [s for s, known in late.answered if 8 < s < 39]

@@ -45,7 +45,7 @@ def test_late_publisher_with_weaker_qos_is_recorded(processes, peer, tmp_path):
         assert {m.data for _, _, m in bag.messages({"/robot/text"})} == {"first", "later"}
 
 
-def test_recording_continues_if_a_type_is_not_installed(monkeypatch, peer, start, tmp_path):
+def test_recording_continues_if_a_type_is_not_installed(monkeypatch, peer, start_node, tmp_path):
     from lidar_perception.nodes.replay import bag_recorder
 
     known = bag_recorder.load_message_class
@@ -58,14 +58,14 @@ def test_recording_continues_if_a_type_is_not_installed(monkeypatch, peer, start
     monkeypatch.setattr(bag_recorder, "load_message_class", lacking)
     peer.advertise("/info", INFO)
     peer.advertise("/text", TEXT)
-    node = start(bag_recorder.BagRecorder, bag=str(tmp_path / "bag"), topics=("/info", "/text"))
+    node = start_node(bag_recorder.BagRecorder, bag=str(tmp_path / "bag"), topics=("/info", "/text"))
     peer.wait(lambda: [node._discover(), not node.waiting][1], "both to be found")
     node.close()
     with Bag(tmp_path / "bag") as bag:
         assert list(bag.topics) == ["/text"]
 
 
-def test_slow_recorder_drops_and_reports_messages(monkeypatch, start, tmp_path):
+def test_slow_recorder_drops_and_reports_messages(monkeypatch, start_node, tmp_path):
     """Also while simulated time does not advance."""
     from lidar_perception.nodes.replay import bag_recorder
 
@@ -78,7 +78,9 @@ def test_slow_recorder_drops_and_reports_messages(monkeypatch, start, tmp_path):
         "create_subscription",
         lambda self, kind, topic, received, *_, **__: kept.append(received),
     )
-    node = start(bag_recorder.BagRecorder, **{"bag": str(tmp_path / "bag"), "topics": ["/a"], "use_sim_time": True})
+    node = start_node(
+        bag_recorder.BagRecorder, **{"bag": str(tmp_path / "bag"), "topics": ["/a"], "use_sim_time": True}
+    )
     node.kind_by_topic["/a"] = None
     node._subscribe("/a")
     try:

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from robot_messages import PERIOD, START, WALKING, message, mount_pose, transforms, walker
+from robot_messages import PERIOD, START, WALKING, make_robot_cloud, make_walker, mount_pose, transforms
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
@@ -79,7 +79,7 @@ def test_tilted_sensor_gets_its_mount_from_tf(processes, peer):
     pytest.importorskip("tf2_msgs", reason="the wheels of the pip environment lack tf2_msgs")
     base = mount_pose(0.5, 0.2, 1.7, 0.0, 0.3, -0.2)
     moved = mount_pose(30.0, -4.0, 0.0, 0.0, 0.0, 0.0)
-    xyz, person = walker(base)
+    xyz, person = make_walker(base)
     processes.start("perception", {"~/input/points": "/in"}, {**WALKING, "base_frame": "base", "target_frame": "odom"})
     static = peer.advertise("/tf_static", TF_MESSAGE, STATIC_QOS)
     static.publish(encode(transforms(("base", "lidar", base, 0))))
@@ -102,7 +102,7 @@ def test_tilted_sensor_gets_its_mount_from_tf(processes, peer):
     peer.send(moving, early, moving.get_subscription_count, "a subscriber of /tf")
     peer.send(
         talker,
-        message(xyz),
+        make_robot_cloud(xyz),
         lambda: "waits for the newest transform of 'odom' -> 'base'" in peer.get_message("perception"),
         "a cloud, once /tf_static is there, to wait",
     )

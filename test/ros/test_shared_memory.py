@@ -41,7 +41,7 @@ def test_driver_clouds_use_udp_with_large_socket_buffer(remap, buffer, profile, 
     assert Path(os.environ[PROFILE_VARIABLES[0]]).name == profile
 
 
-def segments(pid: int | str) -> set[Path]:
+def find_segments(pid: int | str) -> set[Path]:
     """Return the segments that a process has open: its own and others of its domain."""
     with suppress(OSError):  # the process has ended, or belongs to another user
         maps = Path(f"/proc/{pid}/maps").read_text()
@@ -52,13 +52,13 @@ def segments(pid: int | str) -> set[Path]:
 def shares_no_segment(process) -> bool:
     """Return True if a process shares no segment with another process."""
     return all(
-        segments(process.pid).isdisjoint(segments(other.name))
+        find_segments(process.pid).isdisjoint(find_segments(other.name))
         for other in Path("/proc").glob("[0-9]*")
         if other.name != str(process.pid)
     )
 
 
-def short():
+def start_short_process():
     """Start a process shares_no_segment in its domain."""
     code = "import rclpy; rclpy.init(); node = rclpy.create_node('short'); print(); input()"
     while True:
@@ -76,8 +76,8 @@ def short():
 
 
 def test_only_shared_memory_of_killed_process_is_removed(capsys):
-    with short() as killed, short() as living:
-        theirs, others = segments(killed.pid), segments(living.pid)
+    with start_short_process() as killed, start_short_process() as living:
+        theirs, others = find_segments(killed.pid), find_segments(living.pid)
 
         def remove_as_if_old():
             """Make the segments look old only during the call, because other starting nodes would remove them."""

@@ -66,7 +66,7 @@ RVIZ = {
 
 
 @pytest.fixture(scope="module")
-def graph(domain):
+def graph_topics(domain):
     """Return {topic: type} and {topic: QoS of its publishers} of all nodes as launch files start
     them."""
     context = create_context(domain)
@@ -88,13 +88,13 @@ def graph(domain):
     shut_down_context(context, *nodes)
 
 
-def rviz_manager():
+def load_rviz_manager():
     return yaml.safe_load((CONFIG / "lidar_perception.rviz").read_text())["Visualization Manager"]
 
 
-def test_every_topic_of_the_rviz_file_is_in_the_graph(graph):
-    types, offered = graph
-    manager = rviz_manager()
+def test_every_topic_of_the_rviz_file_is_in_the_graph(graph_topics):
+    types, offered = graph_topics
+    manager = load_rviz_manager()
     shown = [d for d in manager["Displays"] + manager["Tools"] if "Topic" in d]
     assert {"clustering/output/points", "clicked_point"} < {d["Topic"]["Value"] for d in shown}
     for display in shown:
@@ -105,8 +105,8 @@ def test_every_topic_of_the_rviz_file_is_in_the_graph(graph):
             assert compatible(offered[topic], wanted)[0] != QoSCompatibility.ERROR, topic
 
 
-def test_every_topic_of_the_foxglove_layout_is_in_the_graph(graph):
-    types, _ = graph
+def test_every_topic_of_the_foxglove_layout_is_in_the_graph(graph_topics):
+    types, _ = graph_topics
     panels = json.loads((CONFIG / "foxglove_layout.json").read_text())["configById"]
     for name, panel in panels.items():
         kind = name.partition("!")[0]
@@ -127,13 +127,13 @@ def test_every_topic_of_the_foxglove_layout_is_in_the_graph(graph):
 def test_rviz_and_foxglove_show_the_same_topics():
     layout = json.loads((CONFIG / "foxglove_layout.json").read_text())["configById"]
     topics = next(p["topics"] for n, p in layout.items() if n.startswith("3D!"))
-    displays = [d for d in rviz_manager()["Displays"] if "Topic" in d]
+    displays = [d for d in load_rviz_manager()["Displays"] if "Topic" in d]
     assert {f"/{d['Topic']['Value']}": d["Enabled"] for d in displays} == {
         topic: how["visible"] for topic, how in topics.items()
     }
 
 
-def costmap_layers():
+def load_costmap_layers():
     """Return (plugin, parameters) of each recipe in nav2.md."""
     for block in re.findall(r"```yaml\n(.*?)```", NAV2.read_text(), re.S):
         params = yaml.safe_load(block)["local_costmap"]["local_costmap"]["ros__parameters"]
@@ -142,10 +142,10 @@ def costmap_layers():
                 yield params[name]["plugin"], params[name]
 
 
-def test_nav2_recipes_match_the_published_obstacles(graph):
-    types, offered = graph
-    assert {plugin for plugin, _ in costmap_layers()} == set(LAYERS)
-    for plugin, layer in costmap_layers():
+def test_nav2_recipes_match_the_published_obstacles(graph_topics):
+    types, offered = graph_topics
+    assert {plugin for plugin, _ in load_costmap_layers()} == set(LAYERS)
+    for plugin, layer in load_costmap_layers():
         known, of_source = LAYERS[plugin]
         sources = layer["observation_sources"].split()
         for key in set(layer) - {"plugin", "observation_sources", *sources}:

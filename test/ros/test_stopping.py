@@ -53,7 +53,7 @@ if importlib.util.find_spec("rclpy"):
 
 
 @pytest.fixture(scope="module")
-def ended():
+def finished_cases():
     """Run all cases at the same time; return {case: (output, exit code)}."""
     running = {
         name: subprocess.Popen([sys.executable, "-c", PROGRAM.format(rest=rest)], text=True, stdout=subprocess.PIPE)
@@ -67,12 +67,12 @@ def ended():
 
 
 @pytest.mark.parametrize("name", list(CASES))
-def test_node_ends_although_a_callback_hangs(ended, name):
+def test_node_ends_although_a_callback_hangs(finished_cases, name):
     _, _, code, output = CASES[name]
-    assert ended[name] == (output, code)
+    assert finished_cases[name] == (output, code)
 
 
-class Changing:
+class ChangingGraph:
     """Node in whose graph other nodes keep leaving for some time, or forever."""
 
     def __init__(self, looks):
@@ -98,7 +98,7 @@ def test_context_shuts_down_after_the_graph_is_stable(looks, monkeypatch):
     clock, ended = [0.0], []
     monkeypatch.setattr(external_node, "monotonic", lambda: clock[0])
     monkeypatch.setattr(external_node, "sleep", lambda s: clock.__setitem__(0, clock[0] + s))
-    context, node = SimpleNamespace(try_shutdown=lambda: ended.append(clock[0])), Changing(looks)
+    context, node = SimpleNamespace(try_shutdown=lambda: ended.append(clock[0])), ChangingGraph(looks)
     shut_down_context(context, node)
     if looks == 3:
         assert node.destroyed < 0 and SETTLE_S < ended[0] < 2 * SETTLE_S

@@ -11,7 +11,17 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 from rclpy.qos import QoSProfile
 from robot_bags import read_pose
 from ros_samples import MARKERS
-from tracking_samples import CAR, CYCLIST, START, TENTH, car, cars, crowd, person, pose
+from tracking_samples import (
+    CAR,
+    CYCLIST,
+    START,
+    TENTH,
+    make_car,
+    make_crowd_detections,
+    make_detections,
+    make_flat_pose,
+    make_person,
+)
 
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.data.bag import Bag
@@ -38,17 +48,17 @@ ALL_OF_THEM = QoSProfile(depth=1000)
 DELETEALL = 3
 
 
-def header(stamp, frame_id="lidar"):
+def make_cloud_header(stamp, frame_id="lidar"):
     return make_header(stamp, frame_id, make_bag_message)
 
 
-def poses_of(path):
+def read_poses(path):
     """Return the poses of a bag by stamp."""
     with Bag(path) as bag:
         return {to_ns(m.header.stamp): read_pose(m.pose.pose) for _, _, m in bag.messages({ODOMETRY})}
 
 
-def read(message):
+def read_tracks(message):
     """Return stamp, ids, Detections and velocities of an array of tracks."""
     objects = from_marker_array(message)
     return (
@@ -60,7 +70,7 @@ def read(message):
 
 
 def assert_same(message, tracks):
-    _, ids, found, velocities = read(message)
+    _, ids, found, velocities = read_tracks(message)
     assert ids == tracks.ids.tolist()
     np.testing.assert_array_equal(found.boxes[:, :6], tracks.detections.boxes[:, :6])
     np.testing.assert_allclose(found.boxes[:, 6], tracks.detections.boxes[:, 6], atol=1e-6)
@@ -70,7 +80,7 @@ def assert_same(message, tracks):
 
 
 @pytest.fixture(scope="module")
-def looped(domain, drive_bag, tmp_path_factory):
+def looped_messages(domain, drive_bag, tmp_path_factory):
     """Play a drive three times; return {topic: {stamp: its messages in order}} of the graph."""
     params = with_values(BEST, {"seed.source": "automatic"})
     graph = build_graph(["candidates"], single=True, tracking=True)
@@ -126,15 +136,15 @@ def assert_tracked(frames, messages, poses, params):
         tracks = tracker(to_detections(frame), frame.stamp_ns, poses.get(frame.stamp_ns))
         shown.append(tracks if tracker.frame_used else None)
         if tracker.frame_used and (message := next(messages, None)) is not None:
-            assert read(message)[0] == frame.stamp_ns
+            assert read_tracks(message)[0] == frame.stamp_ns
             assert message.markers[0].header.frame_id == "velodyne"
             assert_same(message, tracks)
     return shown
 
 
-def test_graph_tracks_equal_library_tracks_and_end_on_loop(looped, drive_bag):
-    clouds, heard, diagnostics = looped
-    poses = poses_of(drive_bag)
+def test_graph_tracks_equal_library_tracks_and_end_on_loop(looped_messages, drive_bag):
+    clouds, heard, diagnostics = looped_messages
+    poses = read_poses(drive_bag)
     stamps = [from_marker_array(m).stamp_ns for m in heard["found"]]
     assert len(poses) == clouds and stamps[: 2 * clouds] == 2 * sorted(poses)
     shown = assert_tracked(heard["found"], heard["behind"], poses, TrackingParams())
@@ -145,22 +155,22 @@ def test_graph_tracks_equal_library_tracks_and_end_on_loop(looped, drive_bag):
     assert int(diagnostics["ended"]) > 0 and int(diagnostics["born"]) > 0
 
 
-def test_ids_follow_the_people_of_the_drive(looped, drive_bag):
-    clouds, heard, _ = looped
+def test_ids_follow_the_people_of_the_drive(looped_messages, drive_bag):
+    clouds, heard, _ = looped_messages
     with Bag(drive_bag) as bag:
         truth = {o.stamp_ns: to_truth(o) for o in (from_marker_array(m) for _, _, m in bag.messages({TRUTH}))}
     report = TrackingReport()
     for i, message in enumerate(heard["behind"][:clouds]):
-        stamp, ids, found, _ = read(message)
+        stamp, ids, found, _ = read_tracks(message)
         report.update(make_observation("drive", i, truth[stamp], to_tracked_labels(np.array(ids), found)))
     people = report.compute()["classes"]["Pedestrian"]
     assert people["switches"] == 0 and people["hits"] > clouds
 
 
-def test_tracker_inside_the_detector_equals_the_library(looped, drive_bag):
+def test_tracker_inside_the_detector_equals_the_library(looped_messages, drive_bag):
     """Each cloud waits for its pose, like the frames of a tracker node."""
-    _, heard, _ = looped
-    shown = assert_tracked(heard["found"], heard["inside"], poses_of(drive_bag), TrackingParams())
+    _, heard, _ = looped_messages
+    shown = assert_tracked(heard["found"], heard["inside"], read_poses(drive_bag), TrackingParams())
     assert any(t is not None and len(t) for t in shown)
 
 
@@ -183,72 +193,72 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
     def frame(found, frame_id="lidar"):
         nonlocal now
         now += TENTH
-        return make_detection_markers(found, header(now, frame_id), make_bag_message)
+        return make_detection_markers(found, make_cloud_header(now, frame_id), make_bag_message)
 
     def move(poses, child="lidar"):
         """Send poses of the next frames. A second child frame is used once the first one stops."""
         for i, at in enumerate(poses):
             stamp = now + (i + 1) * TENTH
-            message = make_odometry(at, header(stamp, "odom"), child, make_bag_message)
+            message = make_odometry(at, make_cloud_header(stamp, "odom"), child, make_bag_message)
             moving.publish(encode(message))
         peer.send(moving, message, lambda: peer.get_value(NODE, "last_pose_ns") == str(stamp), "the poses")
 
-    found = cars(car(10))
+    found = make_detections(make_car(10))
     for _ in range(3):
-        assert read(send(frame(found)))[1] == [1]
+        assert read_tracks(send(frame(found)))[1] == [1]
     for late, words in (0, "same stamp as the previous one"), (3, "older than the previous one"):
-        old = make_detection_markers(found, header(now - late * TENTH), make_bag_message)
+        old = make_detection_markers(found, make_cloud_header(now - late * TENTH), make_bag_message)
         send(old, words, answered=False)
     send(make_bag_message(MARKERS), "an array without markers", answered=False)
     now += TENTH
-    gone = make_bag_message("visualization_msgs/msg/Marker", header=header(now), action=DELETEALL)
-    assert read(send(make_bag_message(MARKERS, markers=[gone])))[:2] == (now, [1])  # missed in one frame
-    bad = Detections.of([car(10), car(np.nan), [1, 1, 1, 0, 1, 1, 0]], CAR, [0.9, 0.9, np.nan])
-    assert read(send(frame(bad), "2 of 3 detections are ignored"))[1] == [1]
+    gone = make_bag_message("visualization_msgs/msg/Marker", header=make_cloud_header(now), action=DELETEALL)
+    assert read_tracks(send(make_bag_message(MARKERS, markers=[gone])))[:2] == (now, [1])  # missed in one frame
+    bad = Detections.of([make_car(10), make_car(np.nan), [1, 1, 1, 0, 1, 1, 0]], CAR, [0.9, 0.9, np.nan])
+    assert read_tracks(send(frame(bad), "2 of 3 detections are ignored"))[1] == [1]
     many = np.random.default_rng(0).uniform(1, 80, (10_000, 7))
     crowded = send(frame(Detections.of(many, CAR, 0.9)), "the frame has 10000 detections")
-    assert len(read(crowded)[1]) <= 300
+    assert len(read_tracks(crowded)[1]) <= 300
     send(frame(found, "other"), "are mixed")
     now += 100 * TENTH
-    before = read(send(frame(found), "are mixed"))[1]
+    before = read_tracks(send(frame(found), "are mixed"))[1]
     for i in range(6):  # changing classes stay one track
-        last = send(frame(cars(person(30), kind=[PEDESTRIAN, CYCLIST][i % 2])))
-    assert len({*read(last)[1]} - {*before}) == 1
+        last = send(frame(make_detections(make_person(30), kind=[PEDESTRIAN, CYCLIST][i % 2])))
+    assert len({*read_tracks(last)[1]} - {*before}) == 1
 
-    assert read(send(make_detection_markers(found, header(0), make_bag_message), "no stamps"))[0] == 0
-    move([pose(0.8 * i) for i in range(12)])
+    assert read_tracks(send(make_detection_markers(found, make_cloud_header(0), make_bag_message), "no stamps"))[0] == 0
+    move([make_flat_pose(0.8 * i) for i in range(12)])
     send(frame(found), "first pose arrived")
     for i in range(1, 12):
-        last = send(frame(cars(car(10 - 0.8 * i))))
-    assert np.abs(read(last)[3][0]).max() < 0.3  # the object does not move
+        last = send(frame(make_detections(make_car(10 - 0.8 * i))))
+    assert np.abs(read_tracks(last)[3][0]).max() < 0.3  # the object does not move
     arrows = {m.ns for m in last.markers if m.action == ADD}
     assert arrows == {"Car", "number", "trail"}
     now += 6 * TENTH
-    send(frame(cars(car(10 - 0.8 * 18))), "pose is missing")
-    move([pose(0.8 * 19)], "base")
-    send(frame(cars(car(10 - 0.8 * 19))), "odometry is for 'base'")
+    send(frame(make_detections(make_car(10 - 0.8 * 18))), "pose is missing")
+    move([make_flat_pose(0.8 * 19)], "base")
+    send(frame(make_detections(make_car(10 - 0.8 * 19))), "odometry is for 'base'")
     processes.check()
     assert "Traceback" not in (processes.logs / f"{NODE}.log").read_text()
 
 
-def test_detection_arrays_are_tracked_like_markers(start):
+def test_detection_arrays_are_tracked_like_markers(start_node):
     """The node runs in this process, because vision_msgs may be missing."""
-    node, tracker = start(TrackerNode), Tracker()
+    node, tracker = start_node(TrackerNode), Tracker()
     node.transforms.on_odometry(
-        make_odometry(pose(50, 0, 1), header(START, "lidar"), "base", make_bag_message)
+        make_odometry(make_flat_pose(50, 0, 1), make_cloud_header(START, "lidar"), "base", make_bag_message)
     )  # detections are in its fixed frame
-    for i, found in enumerate(crowd()):
+    for i, found in enumerate(make_crowd_detections()):
         stamp = START + i * TENTH
         node.on_detections(
             to_detection_array(
                 found.boxes,
                 [CLASSES[kind] for kind in found.class_ids],
                 found.scores.tolist(),
-                header=header(stamp),
+                header=make_cloud_header(stamp),
                 make=make_bag_message,
             )
         )
         tracks = tracker(found, stamp, np.eye(4))
-        shown = read(decode(node.sent["tracks"][-1], MARKERS))
+        shown = read_tracks(decode(node.sent["tracks"][-1], MARKERS))
         assert shown[1] == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]
         np.testing.assert_allclose(shown[2].boxes, tracks.detections.boxes, atol=1e-4)

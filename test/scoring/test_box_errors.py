@@ -16,13 +16,13 @@ from lidar_perception.scoring.kitti.reliability import fit_calibrations, measure
 from lidar_perception.types import Detections, GroundTruth
 
 
-def frame(true: np.ndarray, found: np.ndarray, scores=0.9):
+def make_frame(true: np.ndarray, found: np.ndarray, scores=0.9):
     truth = GroundTruth.of(true, np.full(len(true), CAR))
     detections = Detections.of(found, CAR, scores)
     return compare_objects(to_camera_objects(truth, None), to_camera_objects(to_scored_labels(detections), None))
 
 
-def cars(count: int, rng) -> np.ndarray:
+def make_cars(count: int, rng) -> np.ndarray:
     """Return cars on a spiral that do not touch each other."""
     way, away = np.linspace(-1, 1, count), np.linspace(8, 70, count)
     return np.column_stack(
@@ -36,7 +36,7 @@ def cars(count: int, rng) -> np.ndarray:
     )
 
 
-def moved(boxes: np.ndarray, away=0.0, aside=0.0, **sizes) -> np.ndarray:
+def shift_boxes(boxes: np.ndarray, away=0.0, aside=0.0, **sizes) -> np.ndarray:
     """Shift boxes along the ray and to its left, and change sizes while the bottoms stay in place."""
     azimuth = np.arctan2(boxes[:, 1], boxes[:, 0])
     off = boxes.copy()
@@ -53,41 +53,41 @@ def moved(boxes: np.ndarray, away=0.0, aside=0.0, **sizes) -> np.ndarray:
 @given(st.integers(0, 2**32 - 1))
 def test_scores_equal_to_the_precision_are_reliable(seed):
     rng = np.random.default_rng(seed)
-    true = cars(400, rng)
+    true = make_cars(400, rng)
     true[:, :2] *= 20  # far apart
     share = rng.uniform(0.05, 1, 400)
     found = true.copy()
     found[rng.random(400) >= share] += [1e4, 0, 0, 0, 0, 0, 0]
     honest, modest = (
-        measure_reliability(Comparison.concatenate([frame(true, found, scores)]), "Car")
+        measure_reliability(Comparison.concatenate([make_frame(true, found, scores)]), "Car")
         for scores in (share, 0.05 + share / 10)
     )
     assert sum(row["boxes"] for row in honest["bins"]) == 400
     assert honest["error"] < 12 and modest["error"] > 30
-    assert measure_reliability(Comparison.concatenate([frame(true, found[:0])]), "Car")["error"] is None
+    assert measure_reliability(Comparison.concatenate([make_frame(true, found[:0])]), "Car")["error"] is None
 
 
 @settings(max_examples=5)
 @given(st.integers(0, 2**32 - 1))
 def test_fitted_calibration_recovers_distorted_scores(seed):
     rng = np.random.default_rng(seed)
-    true = cars(3000, rng)
+    true = make_cars(3000, rng)
     true[:, :2] *= 200
     share = rng.uniform(0.02, 0.98, 3000)
     found = true.copy()
     found[rng.random(3000) >= share] += [1e6, 0, 0, 0, 0, 0, 0]
     bent = expit((logit(share) + 0.7) / 1.6)
     slope, offset = fit_calibrations(
-        Comparison.concatenate([frame(true[i::30], found[i::30], bent[i::30]) for i in range(30)])
+        Comparison.concatenate([make_frame(true[i::30], found[i::30], bent[i::30]) for i in range(30)])
     )["Car"]
     assert slope == pytest.approx(1.6, abs=0.25) and offset == pytest.approx(-0.7, abs=0.25)
-    assert fit_calibrations(Comparison.concatenate([frame(true[:5], found[:5], bent[:5])])) == {}
+    assert fit_calibrations(Comparison.concatenate([make_frame(true[:5], found[:5], bent[:5])])) == {}
 
 
 def test_known_box_errors_are_measured():
-    true = cars(20, np.random.default_rng(0))
+    true = make_cars(20, np.random.default_rng(0))
     made = dict(away=0.12, aside=-0.07, bottom=0.1, length=-0.2, width=0.0, height=0.06, yaw=0.05)
-    errors = measure_box_errors([frame(true, moved(true, **made))], "Car", 0.2)
+    errors = measure_box_errors([make_frame(true, shift_boxes(true, **made))], "Car", 0.2)
     for title, row in errors["by_range"].items():
         for name in ERRORS:
             assert row[name]["median"] == pytest.approx(made[name], abs=1e-5), (title, name)
@@ -97,9 +97,9 @@ def test_known_box_errors_are_measured():
 
 
 def test_weak_boxes_and_classes_without_boxes_have_no_errors():
-    true = cars(12, np.random.default_rng(1))
+    true = make_cars(12, np.random.default_rng(1))
     scores = np.full(12, 0.9)
     scores[11] = 0.1
-    assert measure_box_errors([frame(true, moved(true), scores)], "Car")["by_range"]["all"]["pairs"] == 11
-    assert measure_box_errors([frame(true, true[:0])], "Car")["by_range"]["all"]["yaw"]["median"] is None
+    assert measure_box_errors([make_frame(true, shift_boxes(true), scores)], "Car")["by_range"]["all"]["pairs"] == 11
+    assert measure_box_errors([make_frame(true, true[:0])], "Car")["by_range"]["all"]["yaw"]["median"] is None
     assert measure_box_errors([], "Pedestrian")["by_range"]["all"]["pairs"] == 0

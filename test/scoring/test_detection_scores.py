@@ -28,31 +28,31 @@ few = settings(max_examples=15, database=None)
 seeds = st.integers(0, 2**32 - 1)
 
 
-def labels(text):
+def parse_labels(text):
     return to_ground_truth([parse_label(line) for line in text.splitlines()], CALIBRATION.lidar_to_camera)
 
 
-def report(frames, calibration=CALIBRATION):
+def make_report(frames, calibration=CALIBRATION):
     """Return the report of frames, pairs of label text and result text."""
     total = DetectionReport()
     for truth, found in frames:
-        total.update(FrameDetections("frame", labels(truth), labels(found), calibration))
+        total.update(FrameDetections("frame", parse_labels(truth), parse_labels(found), calibration))
     return total
 
 
-def ap(frames):
-    return report(frames).compute()["ap"]
+def compute_ap(frames):
+    return make_report(frames).compute()["ap"]
 
 
-def numbers(content):
+def list_numbers(content):
     """Return all numbers in the ap of a report, in order."""
     if isinstance(content, dict):
-        return [n for value in content.values() for n in numbers(value)]
+        return [n for value in content.values() for n in list_numbers(value)]
     return [] if content is None else [content]
 
 
 # Label of a fully visible car 20 m ahead, 60 pixels high; a result line also has a score.
-def car(
+def format_car(
     kind="Car", left=500, top=150, bottom=210, z=20.0, x=0.0, occluded=0, truncated=0.0, alpha=0.0, score=None, y=1.6
 ):
     line = f"{kind} {truncated} {occluded} {alpha} {left} {top} {left + 100} {bottom} 1.5 1.6 3.9 {x} {y} {z} 0.3"
@@ -63,7 +63,7 @@ REGION = "DontCare -1 -1 -10 {} 100 {} 250 -1 -1 -1 -1000 -1000 -1000 -10"
 WRONG = dict(left=900, z=40.0, x=10.0)  # far away in the image and in 3D
 
 
-def concatenate(*lines):
+def join_lines(*lines):
     return "\n".join(lines)
 
 
@@ -71,7 +71,7 @@ def concatenate(*lines):
 def test_scores_equal_those_of_an_independent_implementation(seed, count, noise):
     rng = np.random.default_rng(seed)
     frames = [reference.random_frame(rng, noise=noise) for _ in range(count)]
-    compared = Comparison.concatenate(report(frames).frames)
+    compared = Comparison.concatenate(make_report(frames).frames)
     few_objects = many_objects = 0
     for metric, overlaps in ROWS.values():
         prepared = reference.prepare(frames, metric)
@@ -91,31 +91,34 @@ def test_scores_equal_those_of_an_independent_implementation(seed, count, noise)
 def test_average_precision_of_four_objects_is_exact():
     # Scores: 0.9 right, 0.8 wrong, 0.7 right, 0.6 wrong, 0.5 right; the fourth car is missed.
     # Recall 1/4, 2/4, 3/4 at precision 1, 2/3, 3/5.
-    truth = concatenate(*(car(left=120 * i, x=6.0 * i) for i in range(4)))
-    found = concatenate(
-        car(score=0.9, left=0),
-        car(score=0.8, **WRONG),
-        car(score=0.7, left=120, x=6.0, alpha=np.pi / 2),
-        car(score=0.6, left=900, z=50.0, x=20.0),
-        car(score=0.5, left=240, x=12.0),
+    truth = join_lines(*(format_car(left=120 * i, x=6.0 * i) for i in range(4)))
+    found = join_lines(
+        format_car(score=0.9, left=0),
+        format_car(score=0.8, **WRONG),
+        format_car(score=0.7, left=120, x=6.0, alpha=np.pi / 2),
+        format_car(score=0.6, left=900, z=50.0, x=20.0),
+        format_car(score=0.5, left=240, x=12.0),
     )
-    row = ap([(truth, found)])["Car"]["3d"]["easy"]
+    row = compute_ap([(truth, found)])["Car"]["3d"]["easy"]
     assert row["objects"] == 4
     # 40 points: 10 up to 1/4, 10 up to 2/4, 10 up to 3/4, 10 beyond.
     assert row["r40"] == pytest.approx(100 * (10 * 1 + 10 * 2 / 3 + 10 * 3 / 5) / 40)
     # 11 points: 0 .1 .2; .3 .4 .5; .6 .7; .8 .9 1.
     assert row["r11"] == pytest.approx(100 * (3 * 1 + 3 * 2 / 3 + 2 * 3 / 5) / 11)
     # The second hit is rotated by 90 degrees: similarities 1, 1 + 1/2, 2 + 1/2 of 1, 3, 5.
-    aos = ap([(truth, found)])["Car"]["aos"]["easy"]
+    aos = compute_ap([(truth, found)])["Car"]["aos"]["easy"]
     assert aos["r40"] == pytest.approx(100 * (10 * 1 + 10 * 1.5 / 3 + 10 * 2.5 / 5) / 40)
 
 
 def test_average_precision_equals_hand_computed_value():
     # 50 hits, 50 false positives, 50 hits: precision is 1 up to recall 1/2. At recall 1 it is 100 / 150, the
     # maximum beyond 1/2.
-    frames = [(car(), concatenate(car(score=0.9 - i * 1e-3), car(score=0.5 + i * 1e-4, **WRONG))) for i in range(50)]
-    frames += [(car(), car(score=0.4 - i * 1e-3)) for i in range(50)]
-    row = ap(frames)["Car"]["bev"]["moderate"]
+    frames = [
+        (format_car(), join_lines(format_car(score=0.9 - i * 1e-3), format_car(score=0.5 + i * 1e-4, **WRONG)))
+        for i in range(50)
+    ]
+    frames += [(format_car(), format_car(score=0.4 - i * 1e-3)) for i in range(50)]
+    row = compute_ap(frames)["Car"]["bev"]["moderate"]
     assert row["r40"] == pytest.approx(100 * (20 * 1 + 20 * 2 / 3) / 40)
     assert row["r11"] == pytest.approx(100 * (6 * 1 + 5 * 2 / 3) / 11)
 
@@ -125,30 +128,30 @@ def test_average_precision_equals_hand_computed_value():
 @pytest.mark.parametrize(
     "case, other_truth, other_found, level, image, space",
     [
-        ("nothing there", None, car(**WRONG, score=0.95), "easy", 50, 50),
-        ("a van", car("Van", **WRONG), car(**WRONG, score=0.95), "easy", 100, 100),
-        ("a truck", car("Truck", **WRONG), car(**WRONG, score=0.95), "easy", 50, 50),
-        ("someone sitting", car("Person_sitting", **WRONG), car(**WRONG, score=0.95), "easy", 50, 50),
-        ("a region", REGION.format(880, 1010), car(**WRONG, score=0.95), "easy", 100, 50),
-        ("half a region", REGION.format(880, 950), car(**WRONG, score=0.95), "easy", 50, 50),
-        ("hidden, easy", car(occluded=1, **WRONG), car(**WRONG, score=0.95), "easy", 100, 100),
-        ("hidden, not told", car(occluded=3, **WRONG), car(**WRONG, score=0.95), "hard", 100, 100),
-        ("cut off", car(truncated=0.16, **WRONG), car(**WRONG, score=0.95), "easy", 100, 100),
-        ("cut off more", car(truncated=0.51, **WRONG), car(**WRONG, score=0.95), "hard", 100, 100),
-        ("39 pixels, easy", None, car(**WRONG, bottom=189, score=0.95), "easy", 100, 100),
-        ("39 pixels, moderate", None, car(**WRONG, bottom=189, score=0.95), "moderate", 50, 50),
-        ("24 pixels", None, car(**WRONG, bottom=174, score=0.95), "hard", 100, 100),
-        ("25 pixels", None, car(**WRONG, bottom=175, score=0.95), "hard", 50, 50),
-        ("another class", None, car("Pedestrian", **WRONG, score=0.95), "easy", 100, 100),
+        ("nothing there", None, format_car(**WRONG, score=0.95), "easy", 50, 50),
+        ("a van", format_car("Van", **WRONG), format_car(**WRONG, score=0.95), "easy", 100, 100),
+        ("a truck", format_car("Truck", **WRONG), format_car(**WRONG, score=0.95), "easy", 50, 50),
+        ("someone sitting", format_car("Person_sitting", **WRONG), format_car(**WRONG, score=0.95), "easy", 50, 50),
+        ("a region", REGION.format(880, 1010), format_car(**WRONG, score=0.95), "easy", 100, 50),
+        ("half a region", REGION.format(880, 950), format_car(**WRONG, score=0.95), "easy", 50, 50),
+        ("hidden, easy", format_car(occluded=1, **WRONG), format_car(**WRONG, score=0.95), "easy", 100, 100),
+        ("hidden, not told", format_car(occluded=3, **WRONG), format_car(**WRONG, score=0.95), "hard", 100, 100),
+        ("cut off", format_car(truncated=0.16, **WRONG), format_car(**WRONG, score=0.95), "easy", 100, 100),
+        ("cut off more", format_car(truncated=0.51, **WRONG), format_car(**WRONG, score=0.95), "hard", 100, 100),
+        ("39 pixels, easy", None, format_car(**WRONG, bottom=189, score=0.95), "easy", 100, 100),
+        ("39 pixels, moderate", None, format_car(**WRONG, bottom=189, score=0.95), "moderate", 50, 50),
+        ("24 pixels", None, format_car(**WRONG, bottom=174, score=0.95), "hard", 100, 100),
+        ("25 pixels", None, format_car(**WRONG, bottom=175, score=0.95), "hard", 50, 50),
+        ("another class", None, format_car("Pedestrian", **WRONG, score=0.95), "easy", 100, 100),
         # A detection of less than 25 pixels is ignored, but it is matched with the car.
-        ("24 pixels, another class", None, car("Pedestrian", bottom=174, score=0.95), "hard", 100, 0),
+        ("24 pixels, another class", None, format_car("Pedestrian", bottom=174, score=0.95), "hard", 100, 0),
         # The higher score is the only threshold, and it has no false positives.
-        ("found twice", None, car(score=0.95), "easy", 100, 100),
+        ("found twice", None, format_car(score=0.95), "easy", 100, 100),
     ],
 )
 def test_false_positives_follow_the_kitti_rules(case, other_truth, other_found, level, image, space):
-    truth = concatenate(car(), *([other_truth] if other_truth else []))
-    rows = ap([(truth, concatenate(car(score=0.9), other_found))])["Car"]
+    truth = join_lines(format_car(), *([other_truth] if other_truth else []))
+    rows = compute_ap([(truth, join_lines(format_car(score=0.9), other_found))])["Car"]
     assert rows["3d"][level]["objects"] == 1
     found = [rows[metric][level]["r40"] for metric in ("image", "bev", "3d")]
     assert found == [image, space, space]
@@ -176,7 +179,7 @@ def test_false_positives_follow_the_kitti_rules(case, other_truth, other_found, 
     ],
 )
 def test_required_objects_follow_the_kitti_rules(change, counted):
-    rows = ap([(car(**change), "")])["Car"]["3d"]
+    rows = compute_ap([(format_car(**change), "")])["Car"]["3d"]
     assert tuple(rows[level]["objects"] if rows[level] else 0 for level in DIFFICULTIES) == counted
 
 
@@ -200,8 +203,8 @@ def test_truncation_level_of_tracks_is_not_a_fraction():
 
 
 def test_missing_label_fields_are_computed_from_the_box():
-    text = "\n".join(car(left=100 * i, x=i - 3.0, z=15.0 + i, alpha=-10) for i in range(6))
-    said, bare = labels(text), labels(text)
+    text = "\n".join(format_car(left=100 * i, x=i - 3.0, z=15.0 + i, alpha=-10) for i in range(6))
+    said, bare = parse_labels(text), parse_labels(text)
     bare = GroundTruth.of(bare.boxes, bare.class_ids)
     said, bare = to_camera_objects(said, CALIBRATION), to_camera_objects(bare, CALIBRATION)
     np.testing.assert_allclose(bare.boxes[:, :6], said.boxes[:, :6], atol=1e-6)
@@ -209,7 +212,7 @@ def test_missing_label_fields_are_computed_from_the_box():
     x, z = np.arange(6) - 3.0, 15.0 + np.arange(6)
     np.testing.assert_allclose(said.alpha, 0.3 - np.arctan2(x, z), atol=1e-9)
     np.testing.assert_allclose(bare.alpha, said.alpha, atol=1e-3)  # the camera is tilted
-    np.testing.assert_allclose(bare.image_boxes, project_boxes(labels(text).boxes, CALIBRATION)[0], atol=1e-9)
+    np.testing.assert_allclose(bare.image_boxes, project_boxes(parse_labels(text).boxes, CALIBRATION)[0], atol=1e-9)
 
 
 @few
@@ -218,8 +221,8 @@ def test_labels_as_detections_score_100(seed):
     rng = np.random.default_rng(seed)
     # Objects are far apart; overlapping labels could match the detection of their neighbour.
     truths = [
-        labels(
-            concatenate(
+        parse_labels(
+            join_lines(
                 *(
                     reference.line(reference.with_pixels({**reference.some_object(rng), "x": 8.0 * k - 8, "z": 20.0}))
                     for k in range(3)
@@ -253,16 +256,16 @@ def test_order_of_detections_does_not_matter(seed):
             f"{line.rsplit(' ', 1)[0]} {rng.integers(1, 4) / 4}"  # many equal scores
             for line in found.splitlines()
         ]
-        frames.append((truth, concatenate(*lines)))
-        shuffled.append((truth, concatenate(*rng.permutation(lines))))
-    assert report(frames).compute() == report(shuffled).compute()
+        frames.append((truth, join_lines(*lines)))
+        shuffled.append((truth, join_lines(*rng.permutation(lines))))
+    assert make_report(frames).compute() == make_report(shuffled).compute()
 
 
 def test_order_of_equal_scores_does_not_matter():
     # Both detections match the first person, only one matches the second.
-    truth = concatenate(*(car("Pedestrian", left=300 * i, x=1.6 * i) for i in range(2)))
-    found = [car("Pedestrian", x=x, score=0.5) for x in (0.8, -0.8)]
-    there, back = (ap([(truth, concatenate(*order))])["Pedestrian"] for order in (found, found[::-1]))
+    truth = join_lines(*(format_car("Pedestrian", left=300 * i, x=1.6 * i) for i in range(2)))
+    found = [format_car("Pedestrian", x=x, score=0.5) for x in (0.8, -0.8)]
+    there, back = (compute_ap([(truth, join_lines(*order))])["Pedestrian"] for order in (found, found[::-1]))
     assert there == back and there["bev_relaxed"]["easy"]["r40"] > 0
 
 
@@ -274,14 +277,17 @@ def test_weaker_false_positive_never_raises_ap(seed):
     worse = [
         (
             truth,
-            concatenate(
+            join_lines(
                 *found.splitlines(),
-                *(car(name, left=2000 + 200 * i, x=300.0, score=-rng.uniform()) for i, name in enumerate(SCORED)),
+                *(
+                    format_car(name, left=2000 + 200 * i, x=300.0, score=-rng.uniform())
+                    for i, name in enumerate(SCORED)
+                ),
             ),
         )
         for truth, found in frames
     ]
-    before, after = numbers(ap(frames)), numbers(ap(worse))
+    before, after = list_numbers(compute_ap(frames)), list_numbers(compute_ap(worse))
     assert len(before) == len(after)
     assert all(a <= b for a, b in zip(after, before))
 
@@ -289,28 +295,28 @@ def test_weaker_false_positive_never_raises_ap(seed):
 def test_report_is_independent_of_batches_and_empty_frames():
     rng = np.random.default_rng(5)
     frames = [reference.random_frame(rng) for _ in range(30)]
-    there, back = (numbers(ap(f)) for f in (frames, [*frames[10:], ("", ""), *frames[:10]]))
+    there, back = (list_numbers(compute_ap(f)) for f in (frames, [*frames[10:], ("", ""), *frames[:10]]))
     assert there == pytest.approx(back, abs=1e-9)
 
 
 def test_scores_without_objects_or_frames_are_missing():
-    content = report([]).compute()
+    content = make_report([]).compute()
     assert content["frames"] == 0 and content["ap"] == {} and content["map_3d"] is None
-    content = report([("", car(score=0.5))]).compute()
+    content = make_report([("", format_car(score=0.5))]).compute()
     assert average_3d(content["ap"]) is None and content["ap"]["Car"]["3d"]["easy"] is None
     json.dumps(content, allow_nan=False)
 
 
 def test_detection_without_angle_has_no_orientation_score():
     flat = "Car -1 -1 -10 500 150 600 210 -1 -1 -1 -1000 -1000 -1000 -10 0.9"  # a 2D detector
-    rows = ap([(car(), flat)])["Car"]
+    rows = compute_ap([(format_car(), flat)])["Car"]
     assert rows["image"]["easy"]["r40"] == 100 and rows["aos"]["easy"] is None
     assert rows["3d"]["easy"]["r40"] == 0
     json.dumps(rows, allow_nan=False)
 
 
 def test_detections_outside_the_image_do_not_count():
-    truth = labels(car())
+    truth = parse_labels(format_car())
     ahead, behind, beside = np.repeat(truth.boxes, 3, axis=0)
     behind[0], beside[1] = -20, 300
     found = Detections.of([ahead, behind, beside], CLASSES.index("Car"), [0.5, 0.9, 0.8])
@@ -326,9 +332,9 @@ def test_detections_outside_the_image_do_not_count():
 
 @pytest.mark.parametrize("broken", [dict(boxes=[[np.nan] * 7]), dict(scores=np.inf)])
 def test_error_about_non_finite_number_names_the_frame(broken):
-    found = Detections.of(**{"boxes": labels(car()).boxes, "class_ids": 0, "scores": 1, **broken})
+    found = Detections.of(**{"boxes": parse_labels(format_car()).boxes, "class_ids": 0, "scores": 1, **broken})
     with pytest.raises(InputError, match=r"^000123: .*box 1 of 1 .*not finite"):
-        DetectionReport().update(FrameDetections("000123", labels(car()), found, CALIBRATION))
+        DetectionReport().update(FrameDetections("000123", parse_labels(format_car()), found, CALIBRATION))
 
 
 @pytest.mark.parametrize(
@@ -344,7 +350,7 @@ def test_error_about_non_finite_number_names_the_frame(broken):
 )
 def test_constant_height_error_is_reported(shift, taller, words):
     total = DetectionReport()
-    truth = labels(concatenate(*(car(left=100 * i, x=5.0 * i - 10) for i in range(5))))
+    truth = parse_labels(join_lines(*(format_car(left=100 * i, x=5.0 * i - 10) for i in range(5))))
     found = Detections.of(truth.boxes + [0, 0, shift, 0, 0, taller, 0], 0, np.arange(5) / 5)
     for _ in range(10):
         total.update(FrameDetections("frame", truth, found, CALIBRATION))
@@ -359,7 +365,7 @@ def test_constant_height_error_is_reported(shift, taller, words):
         assert content["diagnosis"] == []
 
 
-def brute_best(scores):
+def find_best_f1_slowly(scores):
     """Return the highest F1 over all scores as thresholds."""
     return max(scores.make_rows(s)["all"]["f1"] for _, _, found in scores.frames for s in found)
 
@@ -372,7 +378,7 @@ def test_best_score_is_the_maximum_of_all_scores(seed):
         truth, found = (np.column_stack([rng.uniform(-2, 2, (n, 3)), np.ones((n, 4))]) for n in rng.integers(1, 6, 2))
         scores.update(truth, found, rng.integers(0, 3, len(found)) / 2)
     best = scores.make_rows(scores.find_best_score())["all"]["f1"]
-    assert best == pytest.approx(brute_best(scores))
+    assert best == pytest.approx(find_best_f1_slowly(scores))
     assert scores.compute()["of_all"]["all"]["tp"] == sum(
         len(match_centres(found, truth)[0]) for truth, found, _ in scores.frames
     )

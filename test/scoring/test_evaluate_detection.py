@@ -6,9 +6,9 @@ import types
 
 import numpy as np
 import pytest
-from cli_samples import error_line, exit_of
 from cli_samples import evaluate_detection as evaluate
-from samples import CALIBRATION, LABELS, object_folder, write
+from cli_samples import read_error_line, run_main
+from samples import CALIBRATION, LABELS, write_file, write_object_folder
 
 from lidar_perception.data.kitti.results import read_results, write_results
 from lidar_perception.data.open import open_recording
@@ -25,12 +25,12 @@ WHOLE = CAR.replace("0.35 2", "0.00 0")
 ROWS = ("image", "aos", "bev", "3d", "bev_relaxed", "3d_relaxed")
 
 
-def error_of(monkeypatch, capsys, *arguments):
-    assert exit_of(monkeypatch, "evaluate", "detection", *arguments) == 2
-    return error_line(capsys)
+def get_error(monkeypatch, capsys, *arguments):
+    assert run_main(monkeypatch, "evaluate", "detection", *arguments) == 2
+    return read_error_line(capsys)
 
 
-def cells(content):
+def list_cells(content):
     return {
         (name, row, level): cell
         for name in SCORED
@@ -40,22 +40,22 @@ def cells(content):
     }
 
 
-def result_files(folder, text, count=2):
+def write_result_files(folder, text, count=2):
     for i in range(count):
-        write(folder / f"{i:06}.txt", text)
+        write_file(folder / f"{i:06}.txt", text)
     return folder
 
 
 @pytest.fixture
 def kitti(tmp_path):
     """Two frames with a pedestrian and a car in full view."""
-    return object_folder(tmp_path / "kitti", f"{PERSON}\n{WHOLE}\n{REGION}\n")
+    return write_object_folder(tmp_path / "kitti", f"{PERSON}\n{WHOLE}\n{REGION}\n")
 
 
 @pytest.fixture
-def found(tmp_path):
+def result_folder(tmp_path):
     """Result files with the labelled objects."""
-    return result_files(tmp_path / "found", f"{PERSON} 0.9\n{WHOLE} 0.8\n")
+    return write_result_files(tmp_path / "found", f"{PERSON} 0.9\n{WHOLE} 0.8\n")
 
 
 @pytest.fixture
@@ -76,19 +76,19 @@ def detector(monkeypatch):
     return made
 
 
-def truth_of(kitti):
+def read_truth(kitti):
     truth = open_recording(kitti).frames[0].truth()
     return Detections.of(truth.boxes, truth.class_ids, [0.9, 0.8])
 
 
-def test_labels_as_results_score_100_and_are_printed(kitti, found, tmp_path, monkeypatch):
+def test_labels_as_results_score_100_and_are_printed(kitti, result_folder, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    content, text = evaluate(tmp_path, "--data", kitti, "--results", found, "--intervals", 10)
+    content, text = evaluate(tmp_path, "--data", kitti, "--results", result_folder, "--intervals", 10)
     assert content["intervals"]["Car"] == {row: [100, 100] for row in INTERVALS}
     assert content["intervals"]["Cyclist"]["3d"] is None and "100-100" in text
-    assert content["frames"] == 2 and content["source"] == str(found)
-    assert len(cells(content)) == 2 * len(ROWS) * len(DIFFICULTIES)
-    assert {(c["objects"], c["r11"], c["r40"]) for c in cells(content).values()} == {(2, 100, 100)}
+    assert content["frames"] == 2 and content["source"] == str(result_folder)
+    assert len(list_cells(content)) == 2 * len(ROWS) * len(DIFFICULTIES)
+    assert {(c["objects"], c["r11"], c["r40"]) for c in list_cells(content).values()} == {(2, 100, 100)}
     assert content["map_3d"] == {"r11": 100, "r40": 100} and content["ap"]["Cyclist"]["3d"]["easy"] is None
     assert content["pedestrian_centres"]["of_all"]["all"]["f1"] == 1
     for words in ("R40 100.00, R11 100.00", "Pedestrians within 1.0 m", "BEV"):
@@ -98,7 +98,7 @@ def test_labels_as_results_score_100_and_are_printed(kitti, found, tmp_path, mon
 
 def test_single_second_of_a_drive_has_no_interval(kitti, detector, tmp_path):
     """One second of a drive is a single block, so there is nothing to resample."""
-    detector.find = lambda frame: truth_of(kitti)
+    detector.find = lambda frame: read_truth(kitti)
     write_bag(tmp_path / "bag", open_recording(kitti))
     arguments = "--weights", "any", "--intervals", 10
     assert evaluate(tmp_path, "--data", kitti, *arguments)[0]["intervals"]["Car"]["bev"]
@@ -106,37 +106,37 @@ def test_single_second_of_a_drive_has_no_interval(kitti, detector, tmp_path):
     assert content["intervals"]["Car"] == dict.fromkeys(INTERVALS)
 
 
-def test_label_without_scan_is_skipped_by_name(kitti, detector, found, tmp_path):
+def test_label_without_scan_is_skipped_by_name(kitti, detector, result_folder, tmp_path):
     (kitti / "training/velodyne/000001.bin").unlink()
     content, text = evaluate(tmp_path, "--data", kitti, "--weights", "any")
     assert content["frames"] == 1 and "000001.txt has no scan" in content["skipped"][0]
     assert "has no scan" in " ".join(text.split())
     assert (
         evaluate(tmp_path, "--data", kitti, "--weights", "any", "--limit", 1)[0]["skipped"]
-        == evaluate(tmp_path, "--data", kitti, "--results", found)[0]["skipped"]
+        == evaluate(tmp_path, "--data", kitti, "--results", result_folder)[0]["skipped"]
         == []
     )
 
 
-def test_scans_are_not_needed_for_result_files(kitti, found, tmp_path):
-    before, _ = evaluate(tmp_path, "--data", kitti, "--results", found)
+def test_scans_are_not_needed_for_result_files(kitti, result_folder, tmp_path):
+    before, _ = evaluate(tmp_path, "--data", kitti, "--results", result_folder)
     for path in (kitti / "training/velodyne").iterdir():
         path.unlink()
     (kitti / "training/velodyne").rmdir()
-    after, _ = evaluate(tmp_path, "--data", kitti / "training", "--results", found)
+    after, _ = evaluate(tmp_path, "--data", kitti / "training", "--results", result_folder)
     assert after == before
     with pytest.raises(InputError, match="no KITTI scans"):
         open_recording(kitti)
 
 
 def test_checkpoint_is_evaluated_on_every_scan(kitti, detector, tmp_path):
-    detector.find = lambda frame: truth_of(kitti)
+    detector.find = lambda frame: read_truth(kitti)
     content, text = evaluate(tmp_path, "--data", kitti, "--weights", "v4.onnx", "--device", "cpu")
     assert detector.asked == [("v4.onnx", "cpu", MIN_SCORE, SENSOR_HEIGHT)]
     assert len(detector.scans) == 2
     assert len(detector.scans[0]) == len(open_recording(kitti).frames[0].load())
     assert content["ms"] >= 0 and "ms per frame" in text
-    for (_, row, _), cell in cells(content).items():
+    for (_, row, _), cell in list_cells(content).items():
         if row not in ("image", "aos"):  # 2D boxes of these labels are not projections
             assert cell["r40"] == 100
 
@@ -172,14 +172,14 @@ def test_smaller_fraction_is_a_subset_of_a_larger_one(kitti):
 def test_written_results_score_like_the_detections(kitti, detector, tmp_path):
     noise = np.random.default_rng(0)
     detector.find = lambda frame: Detections.of(
-        truth_of(kitti).boxes + noise.normal(0, 0.02, 7), truth_of(kitti).class_ids, [0.123456, 3]
+        read_truth(kitti).boxes + noise.normal(0, 0.02, 7), read_truth(kitti).class_ids, [0.123456, 3]
     )
     out = tmp_path / "out/data"
     direct, text = evaluate(tmp_path, "--data", kitti, "--weights", "w", "--write-results", out)
     assert "result files" in text and sorted(p.name for p in out.iterdir()) == ["000000.txt", "000001.txt"]
     read, _ = evaluate(tmp_path, "--data", kitti, "--results", out)
-    for key, cell in cells(direct).items():
-        assert cells(read)[key] == pytest.approx(cell, abs=1e-3)
+    for key, cell in list_cells(direct).items():
+        assert list_cells(read)[key] == pytest.approx(cell, abs=1e-3)
 
 
 def test_result_files_have_the_detections(tmp_path):
@@ -224,19 +224,19 @@ def test_frames_without_labels_are_written_and_not_scored(kitti, detector, tmp_p
     out = tmp_path / "out"
     content, _ = evaluate(tmp_path, "--data", kitti, "--weights", "w", "--write-results", out)
     assert content["frames"] == 1 and (out / "000001.txt").exists()
-    line = error_of(
+    line = get_error(
         monkeypatch, capsys, "--data", kitti, "--weights", "w", "--write-results", kitti / "training/label_2"
     )
     assert "label_2 already contains files" in line
     (kitti / "training/label_2/000000.txt").unlink()
     content, _ = evaluate(tmp_path, "--data", kitti, "--weights", "w", "--write-results", tmp_path / "others")
     assert content["frames"] == 0
-    line = error_of(monkeypatch, capsys, "--data", kitti, "--weights", "w")
+    line = get_error(monkeypatch, capsys, "--data", kitti, "--weights", "w")
     assert line == f"Error: {kitti}: no frame with labels"
 
 
 def test_truncated_and_rejected_scans_are_listed_as_skipped(kitti, detector, tmp_path):
-    write(kitti / "training/velodyne/000001.bin", b"123")
+    write_file(kitti / "training/velodyne/000001.bin", b"123")
     content, text = evaluate(tmp_path, "--data", kitti, "--weights", "w")
     (line,) = content["skipped"]
     assert "000001.bin" in line and "is truncated" in line and "skipped" in text
@@ -252,7 +252,7 @@ def test_truncated_and_rejected_scans_are_listed_as_skipped(kitti, detector, tmp
 
 
 def test_results_that_cannot_be_written_end_the_run(kitti, detector, monkeypatch, capsys):
-    line = error_of(
+    line = get_error(
         monkeypatch,
         capsys,
         "--data",
@@ -265,10 +265,10 @@ def test_results_that_cannot_be_written_end_the_run(kitti, detector, monkeypatch
     assert line.startswith("Error: cannot write") and not detector.scans
 
 
-def test_split_selects_the_scored_frames(kitti, found, tmp_path):
-    (found / "000000.txt").unlink()
-    split = write(tmp_path / "val.txt", "000001\n000001\n")
-    content, _ = evaluate(tmp_path, "--data", kitti, "--results", found, "--split", split)
+def test_split_selects_the_scored_frames(kitti, result_folder, tmp_path):
+    (result_folder / "000000.txt").unlink()
+    split = write_file(tmp_path / "val.txt", "000001\n000001\n")
+    content, _ = evaluate(tmp_path, "--data", kitti, "--results", result_folder, "--split", split)
     assert content["frames"] == 1
 
 
@@ -284,28 +284,28 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_error_names_the_bad_result_file_and_line(case, kitti, found, monkeypatch, capsys):
+def test_error_names_the_bad_result_file_and_line(case, kitti, result_folder, monkeypatch, capsys):
     content, words = BAD[case]
-    write(found / "000000.txt", content)
-    line = error_of(monkeypatch, capsys, "--data", kitti, "--results", found)
-    assert line.startswith("Error: ") and words in line and str(found) in line
+    write_file(result_folder / "000000.txt", content)
+    line = get_error(monkeypatch, capsys, "--data", kitti, "--results", result_folder)
+    assert line.startswith("Error: ") and words in line and str(result_folder) in line
 
 
-def test_missing_files_and_labels_are_reported(kitti, found, tmp_path, monkeypatch, capsys):
+def test_missing_files_and_labels_are_reported(kitti, result_folder, tmp_path, monkeypatch, capsys):
     def error(*arguments):
-        return error_of(monkeypatch, capsys, "--data", kitti, *arguments)
+        return get_error(monkeypatch, capsys, "--data", kitti, *arguments)
 
     assert "none is not a folder" in error("--results", tmp_path / "none")
-    assert "cannot read the split" in error("--results", found, "--split", tmp_path / "none")
-    split = write(tmp_path / "split.txt", "000001 000007 000008")
-    line = error("--results", found, "--split", split)
+    assert "cannot read the split" in error("--results", result_folder, "--split", tmp_path / "none")
+    split = write_file(tmp_path / "split.txt", "000001 000007 000008")
+    line = error("--results", result_folder, "--split", split)
     assert "such as 000007 (2 in all)" in line and str(kitti) in line
-    assert "is empty" in error("--results", found, "--split", write(split, "\n"))
-    (found / "000001.txt").unlink()
-    assert f"result file {found / '000001.txt'} does not exist" in error("--results", found)
-    write(kitti / "training/label_2/000000.txt", "Car 1 2 3")
-    write(kitti / "training/label_2/000001.txt", "Car 1 2 3")
-    assert "no frame with labels" in (line := error("--results", found)) and "000000.txt:1" in line
+    assert "is empty" in error("--results", result_folder, "--split", write_file(split, "\n"))
+    (result_folder / "000001.txt").unlink()
+    assert f"result file {result_folder / '000001.txt'} does not exist" in error("--results", result_folder)
+    write_file(kitti / "training/label_2/000000.txt", "Car 1 2 3")
+    write_file(kitti / "training/label_2/000001.txt", "Car 1 2 3")
+    assert "no frame with labels" in (line := error("--results", result_folder)) and "000000.txt:1" in line
 
 
 @pytest.mark.parametrize(
@@ -319,11 +319,11 @@ def test_missing_files_and_labels_are_reported(kitti, found, tmp_path, monkeypat
     ],
 )
 def test_contradictory_options_are_rejected(arguments, words, monkeypatch, capsys):
-    assert exit_of(monkeypatch, "evaluate", "detection", *arguments) == 2
+    assert run_main(monkeypatch, "evaluate", "detection", *arguments) == 2
     assert words in capsys.readouterr().err
 
 
-def with_scores(labels):
+def add_scores(labels):
     lines = [line for line in labels.read_text().splitlines() if not line.startswith("DontCare")]
     return "".join(f"{line} {1 - i / 100}\n" for i, line in enumerate(lines))
 
@@ -331,9 +331,9 @@ def with_scores(labels):
 def test_real_labels_as_results_score_100(data, tmp_path):
     root = data / "kitti_object"
     for path in root.glob("training/label_2/*.txt"):
-        write(tmp_path / "found" / path.name, with_scores(path))
+        write_file(tmp_path / "found" / path.name, add_scores(path))
     content, _ = evaluate(tmp_path, "--data", root, "--results", tmp_path / "found")
-    found = cells(content)
+    found = list_cells(content)
     assert content["frames"] == 57 and len(found) == len(SCORED) * len(ROWS) * len(DIFFICULTIES)
     assert {(c["r11"], c["r40"]) for c in found.values()} == {(100, 100)}
     assert found["Car", "3d", "hard"]["objects"] > found["Car", "3d", "easy"]["objects"] > 40
@@ -353,7 +353,7 @@ def test_real_boxes_project_onto_their_2d_labels(data, detector, tmp_path):
 
     detector.find = find
     content, _ = evaluate(tmp_path, "--data", data / "kitti_object", "--weights", "w")
-    for (name, row, _), cell in cells(content).items():
+    for (name, row, _), cell in list_cells(content).items():
         assert cell["r40"] > (80 if name == "Pedestrian" and row in ("image", "aos") else 99.99)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import nuscenes_folder as folder
 import pointnet_samples
 import pytest
-from cli_samples import error_line, exit_of
+from cli_samples import read_error_line, run_main
 from click.testing import CliRunner
 
 from lidar_perception.cli.main import cli
@@ -32,7 +32,7 @@ def root(tmp_path):
     return folder.save(tmp_path / "nuscenes", TABLES)
 
 
-def detections(frame, seed=0):
+def make_detections(frame, seed=0):
     """Labelled objects of the detected classes, slightly displaced, and a Van."""
     truth, rng = frame.truth(), np.random.default_rng(seed)
     kept = np.isin(truth.class_ids, [CLASSES.index(name) for name in NAME_BY_CLASS])
@@ -64,19 +64,19 @@ def evaluate(tmp_path, *arguments):
     return json.loads(path.read_text()), result.stdout
 
 
-def error_of(monkeypatch, capsys, *arguments):
-    assert exit_of(monkeypatch, "evaluate", "nuscenes", *arguments) == 2
-    return error_line(capsys)
+def get_error(monkeypatch, capsys, *arguments):
+    assert run_main(monkeypatch, "evaluate", "nuscenes", *arguments) == 2
+    return read_error_line(capsys)
 
 
-def by_stamp(root):
+def get_frames_by_stamp(root):
     return {frame.stamp_ns: frame for frame in open_nuscenes(root)}
 
 
 def test_checkpoint_and_its_result_file_score_equally(root, detector, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    frames, out = by_stamp(root), tmp_path / "out/results.json"
-    detector.find = lambda scan: detections(frames[scan.stamp_ns])
+    frames, out = get_frames_by_stamp(root), tmp_path / "out/results.json"
+    detector.find = lambda scan: make_detections(frames[scan.stamp_ns])
     direct, text = evaluate(
         tmp_path, "--data", root, "--weights", "w.safetensors", "--device", "cpu", "--write-results", out
     )
@@ -111,7 +111,7 @@ def test_result_file_survives_writing_and_reading(root, tmp_path):
     frames, rng = open_nuscenes(root), np.random.default_rng(0)
     written = {}
     for frame in frames:
-        found = detections(frame)
+        found = make_detections(frame)
         boxes = to_results(found, frame)
         assert len(boxes) == len(found) - 1 and (np.diff(boxes.scores) <= 0).all()
         boxes.velocities[::2] = rng.normal(0, 1, (len(boxes[::2]), 2))
@@ -143,7 +143,7 @@ def test_unreadable_and_rejected_scans_are_reported(root, detector, tmp_path):
     def find(scan):
         if scan.stamp_ns == frames[2].stamp_ns:
             raise InputError("too dark")
-        return detections(by_stamp(root)[scan.stamp_ns])
+        return make_detections(get_frames_by_stamp(root)[scan.stamp_ns])
 
     detector.find = find
     out = tmp_path / "r.json"
@@ -166,10 +166,10 @@ def test_version_without_labels_is_written_and_not_scored(tmp_path, detector, mo
     assert content["frames"] == 0 and content["all"] is None
     assert [len(rows) for rows in json.loads(out.read_text())["results"].values()] == [1] * 8
     assert content["version"] == "v1.0-test"
-    assert "v1.0-test: no frame with labels" in error_of(
+    assert "v1.0-test: no frame with labels" in get_error(
         monkeypatch, capsys, "--data", root / "v1.0-test", "--results", out
     )
-    line = error_of(monkeypatch, capsys, "--data", root, "--results", out)
+    line = get_error(monkeypatch, capsys, "--data", root, "--results", out)
     assert "several versions" in line and str(root / "v1.0-test") in line
 
 
@@ -187,7 +187,7 @@ def test_files_without_results_are_reported(root, tmp_path, monkeypatch, capsys,
     path = tmp_path / "r.json"
     if text is not None:
         path.write_text(text)
-    assert words in error_of(monkeypatch, capsys, "--data", root, "--results", path)
+    assert words in get_error(monkeypatch, capsys, "--data", root, "--results", path)
 
 
 @pytest.mark.parametrize(
@@ -200,13 +200,13 @@ def test_files_without_results_are_reported(root, tmp_path, monkeypatch, capsys,
     ],
 )
 def test_contradictory_options_are_rejected(arguments, words, monkeypatch, capsys):
-    assert exit_of(monkeypatch, "evaluate", "nuscenes", *arguments) == 2
+    assert run_main(monkeypatch, "evaluate", "nuscenes", *arguments) == 2
     assert words in capsys.readouterr().err
 
 
 def test_invalid_scene_files_are_reported(root, tmp_path, monkeypatch, capsys):
     def error(path):
-        return error_of(monkeypatch, capsys, "--data", root, "--weights", "w", "--split", path)
+        return get_error(monkeypatch, capsys, "--data", root, "--weights", "w", "--split", path)
 
     scenes = tmp_path / "scenes.txt"
     assert "cannot read the split" in error(scenes)
@@ -217,10 +217,14 @@ def test_invalid_scene_files_are_reported(root, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    "made, config", [(detection_samples, detection_samples.tiny()), (pointnet_samples, pointnet_samples.small())]
+    "samples, config",
+    [
+        (detection_samples, detection_samples.make_tiny_config()),
+        (pointnet_samples, pointnet_samples.make_small_config()),
+    ],
 )
-def test_detector_gets_the_sensor_height(made, config, tmp_path, one_thread):
-    save_checkpoint(tmp_path / "w", made.lively(config), Header(config))
+def test_detector_gets_the_sensor_height(samples, config, tmp_path, one_thread):
+    save_checkpoint(tmp_path / "w", samples.make_random_network(config), Header(config))
     detector = open_detector(tmp_path / "w", "cpu", sensor_height=1.84)
     assert detector.networks[0].config == config
     assert detector.params.ground.sensor_pose.height == 1.84

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import CALIBRATION, crowd
+from samples import CALIBRATION, make_crowd
 
 from experiments.stm_cpa.frames import load_labelled_frame
 from lidar_perception.candidates.configurations import PAPER
@@ -36,21 +36,21 @@ seeds = st.integers(0, 2**32 - 1)
 small = st.integers(0, 5)
 
 
-def boxes(*centres):
+def make_boxes(*centres):
     out = np.zeros((len(centres), 7))
     out[:, :3] = np.reshape(centres, (-1, 3))
     out[:, 3:6] = 1
     return out
 
 
-def some(rng, count, reach=1.2):
-    return boxes(*rng.uniform(-reach, reach, (count, 3)))
+def draw_boxes(rng, count, reach=1.2):
+    return make_boxes(*rng.uniform(-reach, reach, (count, 3)))
 
 
-def brute_force(found, truth, limit):
+def match_by_brute_force(found, truth, limit):
     """Return the best assignment: most pairs, then smallest distance."""
     if len(found) > len(truth):
-        return brute_force(truth, found, limit)
+        return match_by_brute_force(truth, found, limit)
     best = (0, 0.0)
     for chosen in permutations(range(len(truth)), len(found)):
         d = [np.linalg.norm(found[i, :3] - truth[j, :3]) for i, j in enumerate(chosen)]
@@ -59,39 +59,39 @@ def brute_force(found, truth, limit):
     return -best[0], best[1]
 
 
-def distances(found, truth, pairs):
+def compute_distances(found, truth, pairs):
     return np.linalg.norm(found[pairs[0], :3] - truth[pairs[1], :3], axis=1)
 
 
 @given(seeds, small, small, st.sampled_from([0.3, 1.0, 5.0]))
 def test_matching_equals_the_best_of_all_assignments(seed, found_count, truth_count, limit):
     rng = np.random.default_rng(seed)
-    found, truth = some(rng, found_count), some(rng, truth_count)
+    found, truth = draw_boxes(rng, found_count), draw_boxes(rng, truth_count)
     pairs = match_centres(found, truth, limit)
-    count, total = brute_force(found, truth, limit)
+    count, total = match_by_brute_force(found, truth, limit)
     assert len(pairs[0]) == len(pairs[1]) == count
-    assert distances(found, truth, pairs).sum() == pytest.approx(total, abs=1e-9)
+    assert compute_distances(found, truth, pairs).sum() == pytest.approx(total, abs=1e-9)
 
 
 @given(seeds, st.integers(0, 30), st.integers(0, 30))
 def test_matching_is_one_to_one_and_within_the_distance(seed, found_count, truth_count):
     rng = np.random.default_rng(seed)
-    found, truth = some(rng, found_count, 2.0), some(rng, truth_count, 2.0)
+    found, truth = draw_boxes(rng, found_count, 2.0), draw_boxes(rng, truth_count, 2.0)
     i, j = match_centres(found, truth)
     assert len(set(i.tolist())) == len(i) and len(set(j.tolist())) == len(j)
-    assert (distances(found, truth, (i, j)) <= 1.0).all()
+    assert (compute_distances(found, truth, (i, j)) <= 1.0).all()
     back = match_centres(truth, found)
     assert set(zip(*(x.tolist() for x in back))) == set(zip(j.tolist(), i.tolist()))
 
 
 def test_two_pairs_beat_one_perfect_pair():
-    found, truth = boxes([0, 0, 0], [0.9, 0, 0]), boxes([0, 0, 0], [-0.9, 0, 0])
+    found, truth = make_boxes([0, 0, 0], [0.9, 0, 0]), make_boxes([0, 0, 0], [-0.9, 0, 0])
     pairs = match_centres(found, truth)
     assert set(zip(*(x.tolist() for x in pairs))) == {(0, 1), (1, 0)}
 
 
 def test_maximum_distance_in_3d_is_a_hit():
-    truth = boxes([10, 5, -1])
+    truth = make_boxes([10, 5, -1])
     for step in ([1, 0, 0], [0, -1, 0], [0, 0, 1]):
         assert len(match_centres(truth + [*step, 0, 0, 0, 0], truth)[0]) == 1
         assert len(match_centres(truth + [*np.multiply(step, 1.001), 0, 0, 0, 0], truth)[0]) == 0
@@ -99,8 +99,8 @@ def test_maximum_distance_in_3d_is_a_hit():
 
 def test_detections_that_are_not_finite_are_false_positives():
     # Other nodes may send anything; one broken box must not stop the evaluation.
-    truth = boxes([10, 0, 0], [20, 0, 0])
-    found = boxes([np.nan, 0, 0], [20.1, 0, 0], [np.inf, 0, 0])
+    truth = make_boxes([10, 0, 0], [20, 0, 0])
+    found = make_boxes([np.nan, 0, 0], [20.1, 0, 0], [np.inf, 0, 0])
     i, j = match_centres(found, truth)
     assert (i.tolist(), j.tolist()) == ([1], [1])
     score = Score()
@@ -114,11 +114,11 @@ def test_hits_misses_and_false_positives_add_up(seed, frames):
     rng = np.random.default_rng(seed)
     score, truths, found_count = Score(), [np.zeros((0, 7))], 0
     for found_in_frame, truth_in_frame in frames:
-        truth = some(rng, truth_in_frame, 70.0)
+        truth = draw_boxes(rng, truth_in_frame, 70.0)
         truth[:, 2] = 0
         near = truth[rng.random(len(truth)) < 0.5]
         near = near + rng.normal(0, 0.5, near.shape)
-        found = np.concatenate([some(rng, found_in_frame, 70.0), near]).astype(np.float32)
+        found = np.concatenate([draw_boxes(rng, found_in_frame, 70.0), near]).astype(np.float32)
         score.update(found, truth)
         truths.append(truth)
         found_count += len(found)
@@ -139,10 +139,11 @@ def test_hits_misses_and_false_positives_add_up(seed, frames):
 def test_scores_equal_hand_computed_values():
     score = Score()
     score.update(
-        boxes([10.3, 0, 0], [20, 0, 0.5], [14.5, 14.5, 0], [61, 0, 0]), boxes([10, 0, 0], [20, 0, 0], [40, 0, 0])
+        make_boxes([10.3, 0, 0], [20, 0, 0.5], [14.5, 14.5, 0], [61, 0, 0]),
+        make_boxes([10, 0, 0], [20, 0, 0], [40, 0, 0]),
     )
-    score.update(np.zeros((0, 7), np.float32), boxes([5, 0, 0]))
-    score.update(boxes([0, -50, 0]).astype(np.float32), np.zeros((0, 7)))
+    score.update(np.zeros((0, 7), np.float32), make_boxes([5, 0, 0]))
+    score.update(make_boxes([0, -50, 0]).astype(np.float32), np.zeros((0, 7)))
     table = score.make_rows()
     counts = {name: tuple(row[k] for k in ("tp", "fp", "fn")) for name, row in table.items()}
     assert counts == {
@@ -164,12 +165,12 @@ def test_scores_equal_hand_computed_values():
 
 def test_hit_counts_in_the_range_of_the_labelled_object():
     score = Score()
-    score.update(boxes([15.2, 0, 0]), boxes([14.8, 0, 0]))
+    score.update(make_boxes([15.2, 0, 0]), make_boxes([14.8, 0, 0]))
     assert score.make_rows()["0-15"]["tp"] == 1 and score.make_rows()["15-30"]["fp"] == 0
 
 
 def test_range_begins_at_its_lower_limit():
-    at = boxes([0, 0, 9], [14.999, 0, 0], [0, 15, 0], [18, -24, 0], [45, 0, 0], [60, 0, 0], [1e4, 0, 0])
+    at = make_boxes([0, 0, 9], [14.999, 0, 0], [0, 15, 0], [18, -24, 0], [45, 0, 0], [60, 0, 0], [1e4, 0, 0])
     assert [RANGE_NAMES[i] for i in find_range_bins(at)] == ["0-15", "0-15", "15-30", "30-45", "45-60", "60+", "60+"]
 
 
@@ -181,7 +182,7 @@ def test_ratios_are_0_without_detections_or_labels():
 # --- reports -------------------------------------------------------------------------------
 
 
-def scene_points():
+def make_scene_points():
     """A floor at -1.7 m and an upright figure at (7, 0)."""
     rng = np.random.default_rng(0)
     flat = np.column_stack([rng.uniform(-20, 20, (3000, 2)), rng.normal(-1.7, 0.01, 3000)])
@@ -189,21 +190,21 @@ def scene_points():
     return np.concatenate([flat, figure]).astype(np.float32)
 
 
-def frame(name, truth):
-    return Frame.of(name, PointCloud(scene_points()), truth)
+def make_frame(name, truth):
+    return Frame.of(name, PointCloud(make_scene_points()), truth)
 
 
-def cut():
+def raise_cut_frame():
     raise InputError("frame 3 is cut")
 
 
-def truth_of(*centres, label="Pedestrian"):
-    made = boxes(*centres)
+def make_truth(*centres, label="Pedestrian"):
+    made = make_boxes(*centres)
     made[:, 3:6] = [0.6, 0.8, 1.75]
     return GroundTruth.of(made, [CLASSES.index(label)] * len(made))
 
 
-def run(frames, source="ground_truth"):
+def evaluate_frames(frames, source="ground_truth"):
     report, recording = CandidateReport(), Recording(Path("here"), "memory", frames)
     start = partial(measure_candidates, PipelineParams(seed=SeedParams(source=source)))
     fill_report(report, recording, start)
@@ -216,13 +217,13 @@ HERE = (7.05, 0, -0.82)
 
 
 def test_report_is_json_and_counts_every_pedestrian():
-    content, found = run(
+    content, found = evaluate_frames(
         [
-            frame("both", truth_of(HERE, (25, 9, -0.8))),
-            frame("car", truth_of(HERE, label="Car")),
-            frame("none", None),
-            Frame("cut", 0, cut, lambda: truth_of(HERE)),
-            frame("again", truth_of(HERE)),
+            make_frame("both", make_truth(HERE, (25, 9, -0.8))),
+            make_frame("car", make_truth(HERE, label="Car")),
+            make_frame("none", None),
+            Frame("cut", 0, raise_cut_frame, lambda: make_truth(HERE)),
+            make_frame("again", make_truth(HERE)),
         ]
     )
     assert [type(r) for r in found] == [CandidateResult, NoneType, NoneType, SkipReason, CandidateResult]
@@ -238,28 +239,29 @@ def test_report_is_json_and_counts_every_pedestrian():
 
 
 def test_pedestrians_of_a_frame_without_seed_are_missed():
-    content, (found,) = run([frame("far", truth_of((30, 10, -0.8)))])
+    content, (found,) = evaluate_frames([make_frame("far", make_truth((30, 10, -0.8)))])
     assert found.problem and found.boxes and not any(map(len, found.boxes.values()))
     assert content["frames"] == 1 and content["final"]["all"]["fn"] == 1
     assert content["skipped"][0].startswith("far: ")
 
 
 def test_empty_recording_has_an_empty_report():
-    content, _ = run([])
+    content, _ = evaluate_frames([])
     assert content["frames"] == content["ground_truth"] == 0
     assert json.loads(json.dumps(content, allow_nan=False)) == content
 
 
 def test_only_pedestrians_count():
     mixed = GroundTruth.of(
-        boxes([1, 0, 0], [2, 0, 0], [3, 0, 0]), [PEDESTRIAN, CLASSES.index("Person_sitting"), CLASSES.index("Cyclist")]
+        make_boxes([1, 0, 0], [2, 0, 0], [3, 0, 0]),
+        [PEDESTRIAN, CLASSES.index("Person_sitting"), CLASSES.index("Cyclist")],
     )
-    np.testing.assert_array_equal(select_pedestrians(mixed), boxes([1, 0, 0]))
+    np.testing.assert_array_equal(select_pedestrians(mixed), make_boxes([1, 0, 0]))
     assert select_pedestrians(None).shape == (0, 7)
 
 
 def test_labels_behind_the_camera_do_not_count():
-    cloud, truth = crowd(0)
+    cloud, truth = make_crowd(0)
     scan, people = PointCloud(cloud[:, :3], cloud[:, 3]), truth.select_class(PEDESTRIAN)
     ahead, behind, around = (
         Frame.of("a", scan, GroundTruth.of(own, [PEDESTRIAN] * len(own)), CALIBRATION)

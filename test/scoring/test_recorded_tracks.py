@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from marker_messages import make_track_markers
-from tracking_samples import START, TENTH, crowd
+from tracking_samples import START, TENTH, make_crowd_detections
 
 from lidar_perception.data.bag import BagWriter
 from lidar_perception.scoring.recorded import read_results
@@ -25,14 +25,14 @@ MARKERS, TRACKS = "visualization_msgs/msg/MarkerArray", "/tracker/output/tracks"
 
 
 @pytest.fixture(params=[True, False], ids=["with track ids", "without"])
-def recorded(request, tmp_path):
+def recorded_tracks(request, tmp_path):
     """Return a bag of the tracked crowd, whether its labels have track ids, and the last array of
     tracks."""
     tracker, trails = Tracker(), Trails()
     with BagWriter(tmp_path / "bag") as bag:
         for topic in (TRUTH, TRACKS):
             bag.add_topic(topic, MARKERS)
-        for i, found in enumerate(crowd()):
+        for i, found in enumerate(make_crowd_detections()):
             stamp = START + i * TENTH
             header = make_header(stamp, "velodyne", make_bag_message)
             tracks = tracker(found, stamp)
@@ -54,8 +54,8 @@ def recorded(request, tmp_path):
     return tmp_path / "bag", request.param, message
 
 
-def test_recorded_tracks_need_labels_with_ids(recorded):
-    path, with_ids, _ = recorded
+def test_recorded_tracks_need_labels_with_ids(recorded_tracks):
+    path, with_ids, _ = recorded_tracks
     frames = read_results(path, TRACKS)[0]
     assert count_recorded_tracks(frames) == {"Car": 2, "Cyclist": 1, "Pedestrian": 3}
     if with_ids:
@@ -77,6 +77,6 @@ def test_recorded_tracks_need_labels_with_ids(recorded):
     assert read_results(path, "/nothing")[0] == []
 
 
-def test_recorded_tracks_have_trails(recorded):
-    trails = read_trails(recorded[2])
+def test_recorded_tracks_have_trails(recorded_tracks):
+    trails = read_trails(recorded_tracks[2])
     assert {*trails} == {1, 2, 3, 4, 5, 6} and all(len(way) > 5 for way in trails.values())

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import pytest
-from cli_samples import error_line, exit_of
+from cli_samples import read_error_line, run_main
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import object_folder, walker_label, write
+from samples import make_walker_label, write_file, write_object_folder
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.scoring.detections import measure_result_files
@@ -34,12 +34,12 @@ class Names:
         return vars(self)
 
 
-def counting(recording):
+def start_counting(recording):
     """Return (name, number of points) of a frame; None for 000003, which has no labels."""
     return lambda frame: frame.truth() and (frame.name, len(frame.load()))
 
 
-def ending(name, recording):
+def start_ending(name, recording):
     def measure(frame):
         if frame.name == name:
             raise RunError(f"cannot go on after {frame.name}")
@@ -51,27 +51,27 @@ def ending(name, recording):
 @pytest.fixture
 def root(tmp_path):
     """Five frames: the scan of 000001 is truncated, 000003 has no labels."""
-    root = object_folder(tmp_path / "kitti", walker_label(), COUNT)
-    write(root / "training/velodyne/000001.bin", b"123")
+    root = write_object_folder(tmp_path / "kitti", make_walker_label(), COUNT)
+    write_file(root / "training/velodyne/000001.bin", b"123")
     (root / "training/label_2/000003.txt").unlink()
     return root
 
 
 def test_results_do_not_depend_on_number_of_processes(root):
     recording = open_recording(root)
-    one, two = ([*measure_frames(recording, counting, jobs=jobs)] for jobs in (1, 2))
+    one, two = ([*measure_frames(recording, start_counting, jobs=jobs)] for jobs in (1, 2))
     kinds = [type(result) for _, result in one]
     assert one == two and kinds == [type(result) for _, result in two]
     assert kinds == [tuple, SkipReason, tuple, type(None), tuple]
     assert [i for i, _ in one] == [*range(COUNT)]
     chosen = [1, 2, 4]
-    assert [*measure_frames(recording, counting, chosen)] == [one[i] for i in chosen]
-    assert [*measure_frames(recording, counting, [], jobs=3)] == []
+    assert [*measure_frames(recording, start_counting, chosen)] == [one[i] for i in chosen]
+    assert [*measure_frames(recording, start_counting, [], jobs=3)] == []
 
 
 def test_processes_measure_the_frames_of_a_split(root, tmp_path):
-    split = write(tmp_path / "split.txt", "000004 000000 000002")
-    found = [[*measure_frames(open_recording(root, split=split), counting, jobs=jobs)] for jobs in (1, 2)]
+    split = write_file(tmp_path / "split.txt", "000004 000000 000002")
+    found = [[*measure_frames(open_recording(root, split=split), start_counting, jobs=jobs)] for jobs in (1, 2)]
     assert found[0] == found[1]
     assert [name for _, (name, _) in found[0]] == ["000004", "000000", "000002"]
 
@@ -79,7 +79,7 @@ def test_processes_measure_the_frames_of_a_split(root, tmp_path):
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_unreadable_frame_is_skipped_by_name(root, jobs):
     recording, report = open_recording(root), Names()
-    fill_report(report, recording, counting, jobs=jobs)
+    fill_report(report, recording, start_counting, jobs=jobs)
     (line,) = report.skipped
     assert report.names == ["000000", "000002", "000004"]
     assert "000001.bin" in line and "\n" not in line
@@ -89,7 +89,7 @@ def test_unreadable_frame_is_skipped_by_name(root, jobs):
 def test_fatal_error_keeps_earlier_results(root, jobs):
     report = Names()
     with pytest.raises(InputError, match=r"^cannot go on after 000002$"):
-        fill_report(report, open_recording(root), functools.partial(ending, "000002"), jobs=jobs)
+        fill_report(report, open_recording(root), functools.partial(start_ending, "000002"), jobs=jobs)
     assert report.skipped == [] and "000002" not in report.names
     assert report.names == ["000000", "000001"][: len(report.names)]
 
@@ -98,12 +98,12 @@ def test_failed_run_is_reported_in_one_line(root, tmp_path, monkeypatch, capsys)
     (tmp_path / "found").mkdir()
     for jobs in 1, 2:
         assert (
-            exit_of(
+            run_main(
                 monkeypatch, "evaluate", "detection", "--data", root, "--results", tmp_path / "found", "--jobs", jobs
             )
             == 2
         )
-        assert "result file" in error_line(capsys)
+        assert "result file" in read_error_line(capsys)
     with pytest.raises(RunError):
         [*measure_frames(open_recording(root), partial(measure_result_files, tmp_path / "found"))]
 
@@ -130,7 +130,7 @@ def test_limit_reads_no_other_frames(root, limit, expected):
     touched = []
 
     def noting(recording):
-        measure = counting(recording)
+        measure = start_counting(recording)
         return lambda frame: touched.append(frame.name) or measure(frame)
 
     report = Names()
@@ -155,7 +155,7 @@ def test_setup_and_measurements_run_lazily_and_once(root):
 
 def test_recording_without_reopen_needs_one_process(root):
     recording = replace(open_recording(root), reopen=None)
-    assert len([*measure_frames(recording, counting)]) == COUNT
+    assert len([*measure_frames(recording, start_counting)]) == COUNT
 
 
 @given(st.sets(st.integers(0, 20)), st.randoms(use_true_random=False))

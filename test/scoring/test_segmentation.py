@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import DATA, lowered_crowd, needs_data, object_folder, walker_label, write
+from samples import DATA, make_lowered_crowd, make_walker_label, needs_data, write_file, write_object_folder
 
 from lidar_perception.candidates.refine import STAGES
 from lidar_perception.cli.evaluate.candidates import candidates
@@ -43,7 +43,7 @@ seeds = st.integers(0, 2**32 - 1)
 CAR, VAN, TRUCK = (CLASSES.index(name) for name in ("Car", "Van", "Truck"))
 
 
-def objects(owner, region=None, near=None, counted=None, ranges=None):
+def make_objects(owner, region=None, near=None, counted=None, ranges=None):
     """Return objects a, b, c, ... with the given owner of each point."""
     owner = np.asarray(owner, np.int32)
     region = owner if region is None else np.asarray(region, np.int32)
@@ -58,26 +58,26 @@ def objects(owner, region=None, near=None, counted=None, ranges=None):
     )
 
 
-def report_of(cluster_ids, truth) -> dict:
+def compute_report(cluster_ids, truth) -> dict:
     report = ClusterReport()
     score = score_clusters(np.asarray(cluster_ids, np.int32), truth)
     report.update(truth.classes, truth.ranges, score, 2.0)
     return report.compute()
 
 
-def some(seed):
+def draw_frame(seed):
     """Return labels and objects of a random frame, with all kinds of overlap."""
     rng = np.random.default_rng(seed)
     owner = rng.integers(0, rng.integers(1, 6), 300).astype(np.int32)
     owner = np.unique(owner, return_inverse=True)[1].reshape(-1)
     region = np.where(owner == 0, rng.integers(0, owner.max() + 1, 300) * (rng.random(300) < 0.1), owner)
     found = np.where(rng.random(300) < 0.7, owner, rng.integers(0, 9, 300)).astype(np.int32)
-    return found, objects(owner, region, counted=rng.random(300) < 0.9)
+    return found, make_objects(owner, region, counted=rng.random(300) < 0.9)
 
 
 def test_perfect_clusters_have_perfect_scores():
     owner = np.repeat([0, 1, 2, 3], [40, 10, 20, 30])
-    content = report_of(owner, objects(owner, ranges=np.array([10.0, 20.0, 50.0])))
+    content = compute_report(owner, make_objects(owner, ranges=np.array([10.0, 20.0, 50.0])))
     assert [content[k] for k in ("precision", "f1")] == [1, 1]
     ranges = [content["by_range"][RANGE_NAMES[i]] for i in (0, 1, 3)]
     for row in [content, *content["by_class"].values(), *ranges]:
@@ -87,7 +87,7 @@ def test_perfect_clusters_have_perfect_scores():
 
 def test_two_objects_in_one_cluster_are_both_under_segmented():
     owner = np.repeat([1, 2, 3, 0], [30, 60, 50, 5])
-    content = report_of(np.repeat([4, 4, 7, 0], [30, 60, 50, 5]), objects(owner))
+    content = compute_report(np.repeat([4, 4, 7, 0], [30, 60, 50, 5]), make_objects(owner))
     assert (content["under_segmented"], content["over_segmented"]) == (2, 0)
     # IoU of 30 / 90, 60 / 90, and 1.
     assert content["mean_iou"] == pytest.approx((1 / 3 + 2 / 3 + 1) / 3)
@@ -96,9 +96,9 @@ def test_two_objects_in_one_cluster_are_both_under_segmented():
 
 
 def test_split_and_merged_objects_are_not_hits():
-    halves = report_of(np.repeat([1, 2], 20), objects(np.ones(40)))
+    halves = compute_report(np.repeat([1, 2], 20), make_objects(np.ones(40)))
     assert (halves["over_segmented"], halves["mean_pieces"], halves["under_segmented"]) == (1, 2, 0)
-    both = report_of(np.ones(40), objects(np.repeat([1, 2], 20)))
+    both = compute_report(np.ones(40), make_objects(np.repeat([1, 2], 20)))
     assert (both["over_segmented"], both["mean_pieces"], both["under_segmented"]) == (0, 1, 2)
     for content in (halves, both):
         assert (content["mean_iou"], content["hits"], content["f1"]) == (0.5, 0, 0)
@@ -106,7 +106,7 @@ def test_split_and_merged_objects_are_not_hits():
 
 def test_fragment_counts_from_a_tenth_of_the_object():
     for small, pieces in ((9, 1), (10, 2)):
-        score = score_clusters(np.repeat([3, 1], [100 - small, small]), objects(np.ones(100)))
+        score = score_clusters(np.repeat([3, 1], [100 - small, small]), make_objects(np.ones(100)))
         assert score.pieces.tolist() == [pieces]
 
 
@@ -117,7 +117,7 @@ def test_scores_equal_hand_computed_values():
     found = np.repeat([1, 0, 0, 1, 2, 3, 4], [8, 2, 10, 2, 4, 6, 3])
     near = np.repeat([1, 1, 1, 0, 0, 0, 1], [8, 2, 10, 2, 4, 6, 3])
     near[22:24] = 1
-    content = report_of(found, objects(owner, near=near, ranges=np.array([14.9, 45.0])))
+    content = compute_report(found, make_objects(owner, near=near, ranges=np.array([14.9, 45.0])))
     assert (content["clusters"], content["judged_clusters"]) == (4, 2)
     assert (content["objects"], content["hits"]) == (2, 1)
     assert content["mean_iou"] == pytest.approx(8 / 12 / 2)
@@ -131,23 +131,23 @@ def test_scores_equal_hand_computed_values():
 
 def test_neutral_points_count_for_other_objects():
     owner, region = np.repeat([1, 0, 2], [10, 10, 10]), np.repeat([1, 1, 2], [10, 10, 10])
-    clean = score_clusters(np.repeat([1, 0, 2], [10, 10, 10]), objects(owner, region))
-    with_road = score_clusters(np.repeat([1, 1, 2], [10, 10, 10]), objects(owner, region))
+    clean = score_clusters(np.repeat([1, 0, 2], [10, 10, 10]), make_objects(owner, region))
+    with_road = score_clusters(np.repeat([1, 1, 2], [10, 10, 10]), make_objects(owner, region))
     assert clean.iou.tolist() == with_road.iou.tolist() == [1, 1]
-    other = score_clusters(np.repeat([1, 2, 2], [10, 10, 10]), objects(owner, region))
+    other = score_clusters(np.repeat([1, 2, 2], [10, 10, 10]), make_objects(owner, region))
     assert other.iou.tolist() == [1, 0.5]
 
 
 @pytest.mark.parametrize("counted", [0, 10, 20])
 def test_clusters_of_ignored_points_are_not_scored(counted):
     """Most points of a frame can be unlabelled."""
-    truth = objects(np.repeat([1, 0, 2], 10), near=np.ones(30), counted=np.arange(30) < counted)
+    truth = make_objects(np.repeat([1, 0, 2], 10), near=np.ones(30), counted=np.arange(30) < counted)
     assert score_clusters(np.repeat([1, 2, 3], 10), truth).judged_count == counted / 10
 
 
 @given(seeds)
 def test_order_of_points_and_cluster_ids_do_not_matter(seed):
-    found, truth = some(seed)
+    found, truth = draw_frame(seed)
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(found))
     large = rng.permutation(np.unique(rng.integers(1, 2**31, 40)))[:10]  # lookup tables would take gigabytes
@@ -155,12 +155,12 @@ def test_order_of_points_and_cluster_ids_do_not_matter(seed):
     shuffled = replace(
         truth, **{name: getattr(truth, name)[order] for name in ("owner", "region", "is_near", "is_counted")}
     )
-    assert report_of(renamed[order], shuffled) == report_of(found, truth)
+    assert compute_report(renamed[order], shuffled) == compute_report(found, truth)
 
 
 @given(seeds)
 def test_scores_equal_a_plain_loop_over_sets(seed):
-    found, truth = some(seed)
+    found, truth = draw_frame(seed)
     score = score_clusters(found, truth)
     keep = truth.is_counted
     sets = {c: set(np.flatnonzero(keep & (found == c))) for c in set(found.tolist()) - {0}}
@@ -181,14 +181,14 @@ def test_scores_equal_a_plain_loop_over_sets(seed):
 
 
 def test_scores_are_defined_without_clusters_or_objects():
-    nothing = report_of(np.zeros(20), objects(np.ones(20)))
+    nothing = compute_report(np.zeros(20), make_objects(np.ones(20)))
     assert (nothing["recall"], nothing["precision"], nothing["mean_iou"]) == (0, 0, 0)
     for found in (np.zeros(20), np.ones(20), np.zeros(0)):
-        empty = report_of(found, objects(np.zeros(len(found))))
+        empty = compute_report(found, make_objects(np.zeros(len(found))))
         assert (empty["objects"], empty["judged_clusters"], empty["by_class"]) == (0, 0, {})
 
 
-def column(x, y, z, count):
+def make_column(x, y, z, count):
     """Return `count` points at x, y and heights z[0] .. z[1]."""
     return np.column_stack([np.full(count, x), np.full(count, y), np.linspace(*z, count)])
 
@@ -196,11 +196,11 @@ def column(x, y, z, count):
 def test_low_points_are_neutral_and_small_objects_ignored():
     xyz = np.concatenate(
         [
-            column(10, 0, (-1.65, -1.55), 5),
-            column(10, 0, (-1.45, 0), 12),
-            column(20, 0, (-1.4, 0), 9),
-            column(10, 1.1, (-1, 0), 3),
-            column(30, 0, (-1, 0), 4),
+            make_column(10, 0, (-1.65, -1.55), 5),
+            make_column(10, 0, (-1.45, 0), 12),
+            make_column(20, 0, (-1.4, 0), 9),
+            make_column(10, 1.1, (-1, 0), 3),
+            make_column(30, 0, (-1, 0), 4),
         ]
     ).astype(np.float32)
     truth = GroundTruth.of([[20, 0, -0.7, 2, 2, 2, 0], [10, 0, -0.7, 2, 2, 2, 0.0]], [CAR, VAN])
@@ -212,7 +212,7 @@ def test_low_points_are_neutral_and_small_objects_ignored():
 
 
 def test_point_in_two_boxes_belongs_to_the_smaller_one():
-    xyz = np.concatenate([column(10, 0, (-1, 0), 20), column(12, 0, (-1, 0), 30)])
+    xyz = np.concatenate([make_column(10, 0, (-1, 0), 20), make_column(12, 0, (-1, 0), 30)])
     boxes = [[10, 0, 0, 1, 1, 4, 0], [11, 0, 0, 5, 3, 4, 0]]
     for order in ([0, 1], [1, 0]):
         truth = GroundTruth.of(np.array(boxes)[order], np.array([CAR, TRUCK])[order])
@@ -222,7 +222,7 @@ def test_point_in_two_boxes_belongs_to_the_smaller_one():
 
 
 def test_dont_care_and_no_boxes_are_no_objects():
-    xyz = column(10, 0, (-1, 0), 20).astype(np.float32)
+    xyz = make_column(10, 0, (-1, 0), 20).astype(np.float32)
     for truth in (GroundTruth.of([[10, 0, 0, 2, 2, 4, 0]], [CLASSES.index("DontCare")]), GroundTruth.of([], [])):
         found = find_objects_in_boxes(xyz, truth)
         assert found.classes == () and not found.owner.any() and not found.is_near.any()
@@ -293,7 +293,7 @@ def test_ground_scores_equal_hand_computed_values():
     assert report.compute()["scans"] == 2 and report.compute()["ms"] == 3.0
 
 
-def semantic_folder(root, scans=("00/000000", "00/000001", "05/000000")):
+def write_semantic_folder(root, scans=("00/000000", "00/000001", "05/000000")):
     """A road 1.73 m below, two cars of 200 points, some unusable returns."""
     rng = np.random.default_rng(0)
     road = rng.uniform(-20, 20, (4000, 3)) * [1, 1, 0.001] - [0, 0, 1.73]
@@ -303,14 +303,14 @@ def semantic_folder(root, scans=("00/000000", "00/000001", "05/000000")):
     labels = np.repeat(np.array([40, 10 | 7 << 16, 252 | 300 << 16, 0], np.uint32), [4000, 200, 200, 2])
     for name in scans:
         sequence, scan = name.split("/")
-        write(root / f"sequences/{sequence}/velodyne/{scan}.bin", cloud.tobytes())
-        write(root / f"sequences/{sequence}/labels/{scan}.label", labels.tobytes())
+        write_file(root / f"sequences/{sequence}/velodyne/{scan}.bin", cloud.tobytes())
+        write_file(root / f"sequences/{sequence}/labels/{scan}.label", labels.tobytes())
     return root
 
 
 def test_folder_is_read_in_order_without_unusable_returns(tmp_path):
-    semantic_folder(tmp_path / "dataset")
-    write(tmp_path / "dataset/sequences/11/velodyne/000000.bin", b"")  # a test sequence
+    write_semantic_folder(tmp_path / "dataset")
+    write_file(tmp_path / "dataset/sequences/11/velodyne/000000.bin", b"")  # a test sequence
     frames = open_recording(tmp_path).frames
     assert [f.name for f in frames] == ["00/000000", "00/000001", "05/000000"]
     assert [f.name for f in open_recording(tmp_path / "dataset")] == [f.name for f in frames]
@@ -335,9 +335,9 @@ def test_folder_is_read_in_order_without_unusable_returns(tmp_path):
     ],
 )
 def test_error_for_broken_folder_names_the_remedy(tmp_path, root, file, content, text):
-    semantic_folder(tmp_path / "kitti", ["00/000000"])
+    write_semantic_folder(tmp_path / "kitti", ["00/000000"])
     if file:
-        write(tmp_path / root / "sequences/00" / file, content)
+        write_file(tmp_path / root / "sequences/00" / file, content)
     with pytest.raises(InputError, match=text) as error:
         for frame in open_recording(tmp_path / root):
             frame.load()
@@ -361,9 +361,9 @@ def run(*arguments):
 
 
 def test_command_scores_every_method_and_skips_broken_scan(tmp_path):
-    root = semantic_folder(tmp_path / "semantic")
-    write(root / "sequences/00/labels/000001.label", b"")
-    kitti = object_folder(tmp_path / "kitti", walker_label() + "\n")
+    root = write_semantic_folder(tmp_path / "semantic")
+    write_file(root / "sequences/00/labels/000001.label", b"")
+    kitti = write_object_folder(tmp_path / "kitti", make_walker_label() + "\n")
     path = tmp_path / "made/here/scores.json"
     result = run("--data", root, "--data", kitti, "--json", path)
     assert result.exit_code == 0, result.output
@@ -380,7 +380,7 @@ def test_command_scores_every_method_and_skips_broken_scan(tmp_path):
 
 
 def test_methods_and_frames_can_be_chosen(tmp_path):
-    root, path = semantic_folder(tmp_path), tmp_path / "a.json"
+    root, path = write_semantic_folder(tmp_path), tmp_path / "a.json"
     assert run("--data", root, "--methods", "threshold", "--limit", 1, "--json", path).exit_code == 0
     content = json.loads(path.read_text())
     assert list(content["ground"]) == ["threshold"] and content["clusters"] == {}
@@ -389,8 +389,8 @@ def test_methods_and_frames_can_be_chosen(tmp_path):
 
 
 def test_error_for_invalid_call_names_the_reason(tmp_path):
-    root = semantic_folder(tmp_path / "semantic", ["00/000000"])
-    kitti = object_folder(tmp_path / "kitti")
+    root = write_semantic_folder(tmp_path / "semantic", ["00/000000"])
+    kitti = write_object_folder(tmp_path / "kitti")
     for arguments, text in (
         ([], "DATA is missing"),
         (["--data", root, "--methods", "magic"], "unknown method"),
@@ -398,7 +398,7 @@ def test_error_for_invalid_call_names_the_reason(tmp_path):
     ):
         result = run(*arguments)
         assert result.exit_code == 2 and text in result.output
-    write(root / "sequences/00/labels/000000.label", b"")
+    write_file(root / "sequences/00/labels/000000.label", b"")
     with pytest.raises(InputError, match="no frame with labels"):
         raise run("--data", root).exception
 
@@ -409,7 +409,7 @@ def test_bag_of_a_lower_sensor_scores_equally(command, tmp_path):
 
     def scores(name, lower, *flags):
         path, bag = tmp_path / f"{name}.json", tmp_path / name
-        write_bag(bag, [lowered_crowd(i, lower) for i in range(3)])
+        write_bag(bag, [make_lowered_crowd(i, lower) for i in range(3)])
         call = "--data", str(bag), "--json", str(path), *flags
         result = CliRunner().invoke(command, call, catch_exceptions=False)
         assert result.exit_code == 0, result.output

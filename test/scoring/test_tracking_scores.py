@@ -54,7 +54,7 @@ def random_sequences(seed: int) -> list[list[Pairs]]:
     return sequences
 
 
-def plainly(sequences):
+def to_plain_frames(sequences):
     return [
         [
             (
@@ -69,7 +69,7 @@ def plainly(sequences):
     ]
 
 
-def counted(sequences):
+def count_sequences(sequences):
     hota, clear = HotaCounts(), ClearCounts()
     for frames in sequences:
         kept = [drop_ignored(f) for f in frames]
@@ -80,12 +80,16 @@ def counted(sequences):
 @pytest.mark.parametrize("seed", range(6))
 def test_fast_scores_equal_a_slow_implementation(seed):
     sequences = random_sequences(seed)
-    hota, clear = counted(sequences)
-    assert [hota[k] for k in ("HOTA", "DetA", "AssA")] == pytest.approx(slow.hota(plainly(sequences)), abs=1e-12)
-    assert (clear.tp, clear.fn, clear.fp, clear.switches, clear.fragments) == slow.clear(plainly(sequences))
+    hota, clear = count_sequences(sequences)
+    assert [hota[k] for k in ("HOTA", "DetA", "AssA")] == pytest.approx(
+        slow.compute_hota(to_plain_frames(sequences)), abs=1e-12
+    )
+    assert (clear.tp, clear.fn, clear.fp, clear.switches, clear.fragments) == slow.compute_clear(
+        to_plain_frames(sequences)
+    )
     curve = score_over_recall(sequences)
     assert [curve[k] for k in ("sAMOTA", "AMOTA", "AMOTP")] == pytest.approx(
-        slow.over_recall(plainly(sequences)), abs=1e-12
+        slow.compute_over_recall(to_plain_frames(sequences)), abs=1e-12
     )
 
 
@@ -94,11 +98,11 @@ def test_scores_do_not_depend_on_track_ids():
     renamed = [
         [replace(f, track_ids=1000 - f.track_ids, true_ids=f.true_ids * 7 + 3) for f in frames] for frames in sequences
     ]
-    assert counted(renamed)[0] == pytest.approx(counted(sequences)[0])
-    assert counted(renamed)[1].switches == counted(sequences)[1].switches
+    assert count_sequences(renamed)[0] == pytest.approx(count_sequences(sequences)[0])
+    assert count_sequences(renamed)[1].switches == count_sequences(sequences)[1].switches
 
 
-def drive(ids=(1, 2), frames=10, switch_at=None, kind=CAR):
+def make_drive(ids=(1, 2), frames=10, switch_at=None, kind=CAR):
     """Return frames (truth, tracks) of two perfectly tracked cars side by side."""
     result = []
     for i in range(frames):
@@ -109,7 +113,7 @@ def drive(ids=(1, 2), frames=10, switch_at=None, kind=CAR):
     return result
 
 
-def scored(frames, order=None, calibration=None):
+def score_drive(frames, order=None, calibration=None):
     report = TrackingReport()
     for i in order or range(len(frames)):
         report.update(make_observation("a", i, *frames[i], calibration))
@@ -117,7 +121,7 @@ def scored(frames, order=None, calibration=None):
 
 
 def test_labels_as_tracks_score_one():
-    score = scored(drive())
+    score = score_drive(make_drive())
     for name in ("HOTA", "DetA", "AssA", "MOTA", "MOTP"):
         assert score[name] == pytest.approx(1.0, abs=1e-5)
     assert (score["switches"], score["fragments"], score["mostly_tracked"]) == (0, 0, 2)
@@ -125,14 +129,14 @@ def test_labels_as_tracks_score_one():
 
 
 def test_swapped_ids_count_as_two_switches():
-    score = scored(drive(switch_at=5))
+    score = score_drive(make_drive(switch_at=5))
     assert score["switches"] == 2 and score["DetA"] == pytest.approx(1.0)
     assert score["AssA"] == pytest.approx(1 / 3)  # each pair: 5 / (10 + 10 - 5)
 
 
 def test_order_of_frames_does_not_matter():
-    frames = drive(switch_at=4)
-    assert scored(frames, order=[9, 3, 1, 0, 2, 8, 7, 4, 5, 6]) == scored(frames)
+    frames = make_drive(switch_at=4)
+    assert score_drive(frames, order=[9, 3, 1, 0, 2, 8, 7, 4, 5, 6]) == score_drive(frames)
 
 
 def test_unnamed_drives_of_a_bag_score_like_named_ones():
@@ -141,7 +145,7 @@ def test_unnamed_drives_of_a_bag_score_like_named_ones():
     def content(named):
         frames, found = [], {}
         for k in range(2):
-            for i, (truth, _) in enumerate(drive()):
+            for i, (truth, _) in enumerate(make_drive()):
                 scan = PointCloud(np.ones((1, 3), np.float32), None, k * 10**10 + i * 10**8)
                 truth = GroundTruth.of(truth.boxes[:: 1 - 2 * k], truth.class_ids, truth.extras)
                 found[scan.stamp_ns] = DetectionResult(Detections.of(truth.boxes, CAR, 0.9))
@@ -171,7 +175,7 @@ def test_frames_without_pose_are_counted_and_reported(capsys):
             index=i,
             pose=lambda i=i: poses[i],
         )
-        for i, (truth, _) in enumerate(drive(frames=3))
+        for i, (truth, _) in enumerate(make_drive(frames=3))
     ]
     for ego, unknown in ("recording", 2), ("none", 0):
         report = TrackingReport()
@@ -187,23 +191,25 @@ def test_frames_without_pose_are_counted_and_reported(capsys):
 
 
 def test_neighbour_classes_and_truncated_labels_are_ignored():
-    vans = drive(kind=VAN)
-    assert scored(vans) is None
-    cut = [(GroundTruth.of(t.boxes, t.class_ids, [{**e, "truncated": 2.0} for e in t.extras]), k) for t, k in drive()]
-    assert scored(cut) is None
+    vans = make_drive(kind=VAN)
+    assert score_drive(vans) is None
+    cut = [
+        (GroundTruth.of(t.boxes, t.class_ids, [{**e, "truncated": 2.0} for e in t.extras]), k) for t, k in make_drive()
+    ]
+    assert score_drive(cut) is None
     behind = [
         (
             GroundTruth.of(t.boxes - [60.0, 0, 0, 0, 0, 0, 0], t.class_ids, t.extras),
             to_tracked_labels(np.arange(1), Detections.of(t.boxes[:1] - 30.0, CAR, 0.9)),
         )
-        for t, _ in drive()
+        for t, _ in make_drive()
     ]
-    assert scored(behind, calibration=FORWARD_CAMERA) is None
-    assert scored(behind)["misses"] == 2 * scored(behind)["false"] == 20
+    assert score_drive(behind, calibration=FORWARD_CAMERA) is None
+    assert score_drive(behind)["misses"] == 2 * score_drive(behind)["false"] == 20
 
 
 def test_track_in_dont_care_region_is_not_a_false_positive():
-    ((_, tracks),) = drive(frames=1)
+    ((_, tracks),) = make_drive(frames=1)
     wide = GroundTruth.of(
         [],
         [],
@@ -225,21 +231,21 @@ def test_track_in_dont_care_region_is_not_a_false_positive():
         ],
     )
     nothing = GroundTruth.of([], [])
-    assert scored([(wide, tracks)], calibration=FORWARD_CAMERA) is None
-    assert scored([(nothing, tracks)], calibration=FORWARD_CAMERA)["false"] == 2
+    assert score_drive([(wide, tracks)], calibration=FORWARD_CAMERA) is None
+    assert score_drive([(nothing, tracks)], calibration=FORWARD_CAMERA)["false"] == 2
 
 
 def test_empty_tracks_or_labels_count_as_errors():
     nothing = GroundTruth.of([], [])
-    missed = scored([(truth, nothing) for truth, _ in drive()])
+    missed = score_drive([(truth, nothing) for truth, _ in make_drive()])
     assert (missed["misses"], missed["HOTA"], missed["sAMOTA"]) == (20, 0.0, 0.0)
-    false = scored([(nothing, tracks) for _, tracks in drive()])
+    false = score_drive([(nothing, tracks) for _, tracks in make_drive()])
     assert (false["false"], false["HOTA"], false["MOTA"]) == (20, 0.0, -20.0)
-    assert scored([(nothing, nothing)]) is None
+    assert score_drive([(nothing, nothing)]) is None
 
 
 def test_error_explains_why_tracks_cannot_be_scored():
-    truth, tracks = drive(frames=1)[0]
+    truth, tracks = make_drive(frames=1)[0]
     twice = to_tracked_labels(np.array([3, 3]), Detections.of(tracks.boxes, CAR))
     with pytest.raises(InputError, match="a/0: a frame contains the track id 3 twice"):
         make_observation("a", 0, truth, twice)
@@ -256,7 +262,7 @@ def test_error_explains_why_tracks_cannot_be_scored():
 def test_result_file_survives_writing_and_reading(tmp_path):
     frames = [
         (i, np.array([4, 9]), Detections.of(tracks.boxes, [CAR, 4], [0.25, 0.75]))
-        for i, (_, tracks) in enumerate(drive(frames=3))
+        for i, (_, tracks) in enumerate(make_drive(frames=3))
     ]
     path = tmp_path / "0000.txt"
     write_tracking_results(path, frames, FORWARD_CAMERA)

@@ -24,18 +24,18 @@ CHECKED = ("hdl-64e", "vlp-16", "pandarxt-32")  # beams by order, by ring column
 
 
 @cache
-def scans(name):
+def simulate_scans(name):
     return tuple(read_scan(msg) for msg in simulate_clouds(name))
 
 
 @cache
-def measure(name):
-    return measure_sensor(scans(name), [0, 1, 10, 11], name, 12, None)
+def measure_simulated_sensor(name):
+    return measure_sensor(simulate_scans(name), [0, 1, 10, 11], name, 12, None)
 
 
 @pytest.mark.parametrize("name", CHECKED)
 def test_tilted_sensor_is_measured_correctly(name):
-    m, sensor = measure(name), find_sensor(name)
+    m, sensor = measure_simulated_sensor(name), find_sensor(name)
     driver, roll, pitch, height = MOUNTS[name]
     pattern, mount = m.pattern, m.mounting.mount
     assert len(pattern.beams.elevations) == sensor.rings and pattern.model == name
@@ -64,7 +64,7 @@ def test_tilted_sensor_is_measured_correctly(name):
 def test_sensor_file_describes_the_measured_sensor(tmp_path):
     for name in CHECKED:
         path = tmp_path / f"{name}.yaml"
-        path.write_text(format_sensor(measure(name)))
+        path.write_text(format_sensor(measure_simulated_sensor(name)))
         sensor, known = load_sensor(path), find_sensor(name)
         assert sensor.columns == known.columns and sensor.divergence == pytest.approx(known.divergence, abs=1e-6)
         assert np.allclose(sensor.elevations, known.elevations, atol=np.radians(0.05))
@@ -89,7 +89,7 @@ def test_horizontal_slice_of_a_wall_is_not_taken_for_ground():
 def test_known_model_gets_all_beams_from_a_partial_view(tmp_path):
     seen = tuple(
         s._make(column[s.ring > 1] if isinstance(column, np.ndarray) else column for column in s)
-        for s in scans("vlp-16")
+        for s in simulate_scans("vlp-16")
     )
     m = measure_sensor(seen, [0, 1, 10, 11], "part", 12, None)
     (tmp_path / "sensor.yaml").write_text(format_sensor(m))
@@ -111,14 +111,14 @@ def test_model_is_recognised_by_its_beams(name):
 
 
 def test_height_hint_is_used_without_ground():
-    m = measure("vlp-16")
+    m = measure_simulated_sensor("vlp-16")
     m = replace(m, mounting=m.mounting._replace(mount=None, heading=None, height_hint=0.7))
     assert "height: 0.7  # from --height-hint" in format_sensor(m)
     assert "height: 0.7" in format_params(m)
 
 
 def test_beams_from_rings_and_from_elevations_agree():
-    with_rings = scans("vlp-16")
+    with_rings = simulate_scans("vlp-16")
     by_ring, by_elevation = (find_beams(s) for s in (with_rings, [scan._replace(ring=None) for scan in with_rings]))
     assert (by_ring.method, by_elevation.method) == ("ring", "elevation")
     assert np.abs(by_ring.elevations - by_elevation.elevations).max() < 1e-3
@@ -131,7 +131,7 @@ def test_scan_lines_of_non_repeating_pattern_are_not_beams():
     """The four scan lines of a Livox sweep the entire view; here all returns are from a ceiling."""
     rng = np.random.default_rng(0)
     changed = []
-    for scan in scans("vlp-16"):
+    for scan in simulate_scans("vlp-16"):
         away, aside = rng.uniform(2, 12, len(scan.xyz)), np.radians(scan.azimuth)
         xyz = np.column_stack(
             [away * np.cos(aside), away * np.sin(aside), 2 - 0.02 * away + rng.normal(0, 0.01, len(away))]
@@ -148,14 +148,14 @@ def test_scan_lines_of_non_repeating_pattern_are_not_beams():
 
 
 def test_sparse_sensor_gets_wider_neighbourhoods():
-    sparse, dense = (format_params(measure(name)) for name in ("vlp-16", "hdl-64e"))
+    sparse, dense = (format_params(measure_simulated_sensor(name)) for name in ("vlp-16", "hdl-64e"))
     assert "eps: [0.5, 0.7, 0.9, 1.0]" in sparse and "min_samples: 3" in sparse
     assert "eps: [0.15, 0.3, 0.5, 0.7]" not in sparse and "min_samples: 10" in dense
 
 
 def test_cloud_without_columns_warns():
     assert MOUNTS["pandarxt-32"][0] is BARE
-    m = measure("pandarxt-32")
+    m = measure_simulated_sensor("pandarxt-32")
     text = "\n".join(find_warnings(m))
     assert "the clouds have no intensity" in text and "the rate is unknown" in text
     assert "silent: 1  # no intensity in the clouds" in format_sensor(m)
@@ -163,7 +163,7 @@ def test_cloud_without_columns_warns():
 
 
 def test_constant_intensities_are_read_as_0():
-    m = measure("pandarxt-32")
+    m = measure_simulated_sensor("pandarxt-32")
     scans = tuple(s._replace(intensity=np.full(len(s.xyz), 255.0)) for s in m.source.scans)
     same = replace(m, source=m.source._replace(scans=scans))
     full, _ = choose_params(same)["input.intensity_max"]

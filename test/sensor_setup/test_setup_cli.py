@@ -35,7 +35,7 @@ def run(*arguments):
 
 
 @pytest.fixture(scope="module")
-def robot(bag, tmp_path_factory):
+def setup_folder(bag, tmp_path_factory):
     out = tmp_path_factory.mktemp("setup") / "robot"
     result = run("--data", bag, "--out", out, "--height-hint", 1.2)
     assert result.exit_code == 0
@@ -43,36 +43,36 @@ def robot(bag, tmp_path_factory):
     return out
 
 
-def test_every_file_is_written_and_readable(robot):
-    assert sorted(p.name for p in robot.iterdir()) == sorted(FILES)
-    assert load_sensor(robot / "sensor.yaml").rings == 16
-    params = with_values(PipelineParams(), read_config(robot / "robot.param.yaml", PipelineParams()))
+def test_every_file_is_written_and_readable(setup_folder):
+    assert sorted(p.name for p in setup_folder.iterdir()) == sorted(FILES)
+    assert load_sensor(setup_folder / "sensor.yaml").rings == 16
+    params = with_values(PipelineParams(), read_config(setup_folder / "robot.param.yaml", PipelineParams()))
     assert params.ground.sensor_pose.height == pytest.approx(0.6, abs=0.02)
     assert params.ground.sensor_pose.pitch == pytest.approx(0.1396, abs=0.0035)
     assert params.input.intensity_max == 255
     assert params.resolution.elevation_step == pytest.approx(2)
-    layout = (robot / "foxglove_layout.json").read_text()
+    layout = (setup_folder / "foxglove_layout.json").read_text()
     assert '"/lidar/points"' in layout and json.loads(layout)
-    assert "Fixed Frame: lidar\n" in (robot / "lidar_perception.rviz").read_text()
-    assert yaml.safe_load((robot / "lidar_perception.rviz").read_text())
+    assert "Fixed Frame: lidar\n" in (setup_folder / "lidar_perception.rviz").read_text()
+    assert yaml.safe_load((setup_folder / "lidar_perception.rviz").read_text())
 
 
 @pytest.mark.no_cover
-def test_files_are_replaced_only_with_force(robot, bag):
-    before = {p.name: p.read_bytes() for p in robot.iterdir()}
+def test_files_are_replaced_only_with_force(setup_folder, bag):
+    before = {p.name: p.read_bytes() for p in setup_folder.iterdir()}
     with pytest.raises(InputError, match="--force"):
-        run("--data", bag, "--out", robot)
-    assert {p.name: p.read_bytes() for p in robot.iterdir()} == before
-    assert run("--data", bag, "--out", robot, "--topic", "/lidar/points", "--scans", 2, "--force").exit_code == 0
+        run("--data", bag, "--out", setup_folder)
+    assert {p.name: p.read_bytes() for p in setup_folder.iterdir()} == before
+    assert run("--data", bag, "--out", setup_folder, "--topic", "/lidar/points", "--scans", 2, "--force").exit_code == 0
 
 
-def test_simulate_accepts_measured_sensor(robot, tmp_path):
+def test_simulate_accepts_measured_sensor(setup_folder, tmp_path):
     result = CliRunner().invoke(
         cli,
         [
             "simulate",
             "--sensor",
-            str(robot / "sensor.yaml"),
+            str(setup_folder / "sensor.yaml"),
             "--frames",
             "1",
             "--format",

@@ -34,7 +34,7 @@ from msg_utils.stamps import make_header
 
 
 @cache
-def messages():
+def simulate_messages():
     return tuple(simulate_clouds("vlp-16", 6))
 
 
@@ -45,7 +45,7 @@ def change_cloud(msg, change, frame_id="lidar"):
     return from_array(points, make_header(0, frame_id, make_bag_message), make_bag_message)
 
 
-def turn_by(matrix):
+def make_rotation(matrix):
     """Return a function that rotates all points of a cloud."""
 
     def change(points):
@@ -62,10 +62,10 @@ def measure(scans, numbers=(0, 1, 10, 11, 20, 21), stamps=None):
 
 
 def change_scans(change):
-    return [read_scan(change_cloud(msg, change)) for msg in messages()]
+    return [read_scan(change_cloud(msg, change)) for msg in simulate_messages()]
 
 
-def warns(m, *parts):
+def has_warning(m, *parts):
     return any(all(part in line for part in parts) for line in find_warnings(m))
 
 
@@ -73,9 +73,9 @@ def test_motion_of_robot_is_recognised():
     scans = change_scans(None)
     one, drives = measure(scans[:1]), measure(scans)
     still = measure(scans[:1] * 5, (0, 1, 2, 3, 4))
-    assert warns(one, "only one cloud", "record") and one.view.coverage.stationary is None
-    assert warns(still, "stands still", "record") and still.view.coverage.stationary
-    assert not warns(drives, "stands still") and not warns(drives, "only one cloud")
+    assert has_warning(one, "only one cloud", "record") and one.view.coverage.stationary is None
+    assert has_warning(still, "stands still", "record") and still.view.coverage.stationary
+    assert not has_warning(drives, "stands still") and not has_warning(drives, "only one cloud")
 
 
 def test_robot_body_is_found_and_cropped():
@@ -162,7 +162,7 @@ def test_walls_along_the_path_are_not_robot_body(half):
     m = measure(list(simulate_scans(half)), range(8))
     c = m.view.coverage
     assert c.stationary is False and c.has_walls and not c.can_crop and not c.blocked
-    assert warns(m, "walls", "crop.body")
+    assert has_warning(m, "walls", "crop.body")
     c = measure(list(simulate_scans(body=1.5)), range(8)).view.coverage
     assert c.can_crop and not c.has_walls and c.blocked
     assert c.box[0] == pytest.approx(-1.55, abs=0.05)
@@ -178,7 +178,7 @@ def test_passing_people_do_not_mean_robot_motion():
     scans = list(simulate_scans(body=0.5))
     poses = {i: make_tilted_pose(0, 0, 0.6) for i in range(8)}
     parked = measure_sensor(scans, range(8), "parked", 8, None, NO_POSES._replace(poses=poses))
-    assert parked.view.coverage.stationary and warns(parked, "stands still")
+    assert parked.view.coverage.stationary and has_warning(parked, "stands still")
     assert len(parked.view.coverage.box) and not parked.view.coverage.blocked
     # A slow robot hardly moves between successive clouds.
     numbers = [40 * (i // 2) + i % 2 for i in range(8)]
@@ -200,8 +200,8 @@ def test_poses_show_motion_on_uniform_ground():
         poses[7][0, 3] = distance
         m = measure_sensor(ground, range(8), "field", 8, None, NO_POSES._replace(poses=poses))
         assert (m.view.coverage.stationary is False) == drives == m.view.coverage.can_crop
-        assert drives != warns(m, "stands still")
-        assert not warns(m, "cannot tell whether the robot moved")
+        assert drives != has_warning(m, "stands still")
+        assert not has_warning(m, "cannot tell whether the robot moved")
 
 
 def test_clouds_in_a_ground_frame_are_recognised():
@@ -209,7 +209,7 @@ def test_clouds_in_a_ground_frame_are_recognised():
     assert measure_mount(scans) is None and is_on_ground(scans)
     assert not is_on_ground(list(simulate_scans()))
     m = measure(scans, range(8))
-    assert not m.view.coverage.body.any() and warns(m, "base_footprint", "driver's own cloud")
+    assert not m.view.coverage.body.any() and has_warning(m, "base_footprint", "driver's own cloud")
 
 
 @pytest.mark.parametrize("roll, pitch", [(0, 28), (180, -10)])
@@ -219,7 +219,7 @@ def test_tilt_does_not_affect_coverage_and_nearest_ground(roll, pitch):
     mount = m.mounting.mount
     assert np.degrees(mount.pitch) == pytest.approx(pitch, abs=0.5) and not mount.is_level
     assert m.view.coverage.view == (0, 360) and not make_sensor(m).blocked
-    assert warns(m, "level sensor")
+    assert has_warning(m, "level sensor")
     nearest = min(np.hypot(*(s.xyz[p.inliers] @ lean.T)[:, :2].T).min() for s, p in zip(m.source.scans, mount.planes))
     assert choose_params(m)["ground.patchwork.min_range"][0] <= nearest
 
@@ -232,13 +232,13 @@ def test_sector_without_returns_limits_the_field_of_view():
 
 
 def test_frame_with_y_ahead_or_z_down_is_reported():
-    ahead = measure(change_scans(turn_by([[0, -1, 0], [1, 0, 0], [0, 0, 1]])))
+    ahead = measure(change_scans(make_rotation([[0, -1, 0], [1, 0, 0], [0, 0, 1]])))
     assert abs(ahead.mounting.heading.degrees - 90) < 3
-    assert warns(ahead, f"{ahead.mounting.heading.degrees:.0f} deg", "convert --robot")
-    down = measure(change_scans(turn_by(np.diag([1, -1, -1]))))
+    assert has_warning(ahead, f"{ahead.mounting.heading.degrees:.0f} deg", "convert --robot")
+    down = measure(change_scans(make_rotation(np.diag([1, -1, -1]))))
     mount = down.mounting.mount
     assert abs(np.degrees(mount.roll)) == pytest.approx(175, abs=0.3)
-    assert warns(down, "upside down") and mount.height == pytest.approx(0.6, abs=0.02)
+    assert has_warning(down, "upside down") and mount.height == pytest.approx(0.6, abs=0.02)
 
 
 @pytest.mark.parametrize("beams", [True, False])
@@ -253,7 +253,7 @@ def test_upside_down_sensor_is_described_as_mounted(beams):
         return points[(up < np.radians(4)) & (to > np.radians(-30))]
 
     own, other = (
-        measure(change_scans(lambda p, axes=axes: turn_by(np.diag(axes))(select_part(p))))
+        measure(change_scans(lambda p, axes=axes: make_rotation(np.diag(axes))(select_part(p))))
         for axes in ([1, 1, 1], [1, -1, -1])
     )
     level, turned = make_sensor(own), make_sensor(other)
@@ -263,11 +263,11 @@ def test_upside_down_sensor_is_described_as_mounted(beams):
     assert bool(turned.wander) != beams
     if beams:  # beams are denser at the height of people
         up = np.array([14.0, 11, 8, 5, 3, 1, -6, -8, -10, -12, -14])
-        assert with_elevations(own, up).elevation_step == 2
-        assert with_elevations(other, -up[::-1]).elevation_step == 2
+        assert replace_elevations(own, up).elevation_step == 2
+        assert replace_elevations(other, -up[::-1]).elevation_step == 2
 
 
-def with_elevations(m, elevations):
+def replace_elevations(m, elevations):
     beams = m.pattern.beams._replace(elevations=elevations)
     return replace(m, pattern=m.pattern._replace(beams=beams))
 
@@ -288,32 +288,32 @@ def test_heading_is_measured_at_low_and_high_speed(name):
     assert way == pytest.approx(speed * (count - 1) / sensor.rate, abs=0.1)
     for degrees in angles:
         a = np.radians(degrees)
-        turn = turn_by([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+        turn = make_rotation([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
         scans = [read_scan(change_cloud(_to_message(frame), turn)) for frame in frames]
         m = measure(scans, range(count))
         row = next(value for value in list_values(m) if value.name == "ahead")
         if not speed:
-            assert warns(m, "yaw unknown: the robot moved only 0.0 m", "record")
+            assert has_warning(m, "yaw unknown: the robot moved only 0.0 m", "record")
             assert row.value == "unknown"
             continue
         assert abs((m.mounting.heading.degrees - degrees + 180) % 360 - 180) < 5
-        assert warns(m, "drives towards", "input.ahead") == (degrees != 0)
+        assert has_warning(m, "drives towards", "input.ahead") == (degrees != 0)
         assert ("input.ahead" in choose_params(m)) == (degrees in (90, -25))
         assert (
-            warns(m, "backwards") == (degrees == 180)
+            has_warning(m, "backwards") == (degrees == 180)
             and row.confidence == ("low" if degrees else "fair")
-            and not warns(m, "yaw unknown")
+            and not has_warning(m, "yaw unknown")
         )
 
 
 def test_rotated_frame_gives_grid_instead_of_beams():
     def level(points):
-        points = turn_by([[0.906, 0, 0.423], [0, 1, 0], [-0.423, 0, 0.906]])(points)
+        points = make_rotation([[0.906, 0, 0.423], [0, 1, 0], [-0.423, 0, 0.906]])(points)
         points["ring"] = 0
         return points
 
     m = measure(change_scans(level))
-    assert m.pattern.beams is None and warns(m, "no beams", "grid")
+    assert m.pattern.beams is None and has_warning(m, "no beams", "grid")
     grid = make_sensor(m)
     low, high = np.percentile(np.concatenate([s.elevation for s in m.source.scans]), [1, 99])
     assert grid.wander > 0 and grid.rings * grid.columns < 60_000
@@ -322,7 +322,7 @@ def test_rotated_frame_gives_grid_instead_of_beams():
 
 def test_mount_is_unknown_without_ground():
     m = measure(change_scans(lambda p: p[p["z"] > 0.3]))
-    assert m.mounting.mount is None and warns(m, "no ground in view", "sensor_pose")
+    assert m.mounting.mount is None and has_warning(m, "no ground in view", "sensor_pose")
 
 
 def test_unusable_clouds_are_rejected():
@@ -341,7 +341,7 @@ def test_unusable_clouds_are_rejected():
         (lambda p: p[:50], "50 usable points"),
     ):
         with pytest.raises(InputError, match=named) as error:
-            read_scan(change_cloud(messages()[0], change))
+            read_scan(change_cloud(simulate_messages()[0], change))
         assert "\n" not in str(error.value)
     with pytest.raises(InputError, match="2D scanner"):
         measure(change_scans(lambda p: p[p["ring"] == 8]))
@@ -360,7 +360,7 @@ def test_mixed_frames_gaps_and_jumping_stamps_are_reported():
     stamps = np.arange(100) * 10**8
     lossy = np.delete(stamps, [20, 21, 50])
     m = measure(scans, stamps=lossy)
-    assert warns(m, "several frames") and warns(m, "3 clouds are missing")
+    assert has_warning(m, "several frames") and has_warning(m, "3 clouds are missing")
     assert m.timing.missing_count == 3 and m.timing.rate == pytest.approx(10)
     back = measure_timing(scans, np.concatenate([stamps, stamps]))
     assert back.backward_count == 1 and back.missing_count == 0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from footprint_samples import find_overlaps, make_flat_boxes
-from samples import header
+from samples import make_any_header
 
 from lidar_perception.cli.simulate import simulate
 from lidar_perception.data.open import open_recording
@@ -167,7 +167,7 @@ def test_setup_measures_the_sensor_height_indoors(kind):
     sensor = replace(find_sensor("vlp-16", 0.6), azimuth_step=float(np.radians(0.8)))
     frames = [simulate_scan(7, i, sensor, Scenes(kind, 1.0, "indoor")).frame for i in (0, 1, 90, 91)]
     clouds = [
-        from_array(to_point_array(frame), header(make_bag_message, frame.stamp_ns), make_bag_message)
+        from_array(to_point_array(frame), make_any_header(make_bag_message, frame.stamp_ns), make_bag_message)
         for frame in frames
     ]
     mount = measure_mount([read_scan(cloud) for cloud in clouds])

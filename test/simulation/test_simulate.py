@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 from samples import wait_for_the_end
-from simulate_samples import arguments, content, run
+from simulate_samples import make_simulate_arguments, read_files, run_simulate
 
 from lidar_perception.cli.simulate import simulate
 from lidar_perception.data.open import open_recording
@@ -41,8 +41,8 @@ def invoke(options):
     return result
 
 
-def test_data_set_records_its_settings(made):
-    record = json.loads((made / "semantickitti/dataset.json").read_text())
+def test_data_set_records_its_settings(simulated_data_sets):
+    record = json.loads((simulated_data_sets / "semantickitti/dataset.json").read_text())
     assert (
         record.items() >= {"format": "semantickitti", "sensor": "tiny", "seed": 3, "frames": 5, "streets_of": 2}.items()
     )
@@ -50,7 +50,7 @@ def test_data_set_records_its_settings(made):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_failed_data_set_is_marked_and_resumed(made, tmp_path, monkeypatch, layout):
+def test_failed_data_set_is_marked_and_resumed(simulated_data_sets, tmp_path, monkeypatch, layout):
     out, calls = tmp_path / "set", itertools.count()
 
     def fails(*args):
@@ -60,15 +60,15 @@ def test_failed_data_set_is_marked_and_resumed(made, tmp_path, monkeypatch, layo
 
     with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
         patch.setattr(dataset, "simulate_scan", fails)
-        run(out, layout, 5, 1, "--streets-of", 2)
+        run_simulate(out, layout, 5, 1, "--streets-of", 2)
     assert json.loads((out / "INCOMPLETE").read_text())["frames"] == 5
     assert not (out / "dataset.json").exists()
-    result = run(out, layout, 5, 1, "--streets-of", 2, "--resume")
+    result = run_simulate(out, layout, 5, 1, "--streets-of", 2, "--resume")
     assert result.exit_code == 0 and "3 of them from the interrupted run" in result.output
-    assert content(out) == content(made / layout)
-    again = run(out, layout, 5, 1, "--streets-of", 2, "--resume")
+    assert read_files(out) == read_files(simulated_data_sets / layout)
+    again = run_simulate(out, layout, 5, 1, "--streets-of", 2, "--resume")
     assert again.exit_code == 0 and "is already complete" in again.output
-    assert content(out) == content(made / layout)
+    assert read_files(out) == read_files(simulated_data_sets / layout)
 
 
 @pytest.fixture
@@ -81,7 +81,13 @@ def start():
 
     def begin(out, frames, *more):
         process = subprocess.Popen(
-            [sys.executable, "-c", SCRIPT, "simulate", *arguments(out, "kitti-tracking", frames, 2, *more)],
+            [
+                sys.executable,
+                "-c",
+                SCRIPT,
+                "simulate",
+                *make_simulate_arguments(out, "kitti-tracking", frames, 2, *more),
+            ],
             cwd=ROOT,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
             start_new_session=True,
@@ -113,10 +119,10 @@ def test_killed_command_leaves_no_process_and_resumes(start, tmp_path):
     assert (out / "INCOMPLETE").exists()
     (out / "training/velodyne/0000/.000299.bin.1-0.tmp").write_bytes(b"half")  # as after a kill
     assert 3 <= len(list(out.glob(".parts/*.json"))) < frames
-    again = run(out, "kitti-tracking", frames, 1, "--streets-of", 30, "--resume")
+    again = run_simulate(out, "kitti-tracking", frames, 1, "--streets-of", 30, "--resume")
     assert again.exit_code == 0
-    assert run(tmp_path / "whole", "kitti-tracking", frames, 1, "--streets-of", 30).exit_code == 0
-    assert content(out) == content(tmp_path / "whole")
+    assert run_simulate(tmp_path / "whole", "kitti-tracking", frames, 1, "--streets-of", 30).exit_code == 0
+    assert read_files(out) == read_files(tmp_path / "whole")
     assert len(open_recording(out)) == frames
     assert len(list(out.glob("training/label_02/*.txt"))) == 2
 
@@ -125,7 +131,7 @@ def test_data_set_is_locked_until_ctrl_c_ends_all_processes(start, tmp_path):
     process = start(tmp_path / "set", 100_000)
     for more in (["--resume"], ["--force"], []):
         with pytest.raises(InputError, match="another process"):
-            run(tmp_path / "set", "kitti-tracking", 100_000, 2, *more)
+            run_simulate(tmp_path / "set", "kitti-tracking", 100_000, 2, *more)
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     wait_for_the_end(process.pid)
@@ -135,7 +141,7 @@ def test_data_set_is_locked_until_ctrl_c_ends_all_processes(start, tmp_path):
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
-def test_full_disk_is_reported_in_one_line(made, tmp_path, monkeypatch, call):
+def test_full_disk_is_reported_in_one_line(simulated_data_sets, tmp_path, monkeypatch, call):
     out, calls, real = tmp_path / "set", itertools.count(), getattr(os, call)
 
     def full(*args, **others):
@@ -146,53 +152,53 @@ def test_full_disk_is_reported_in_one_line(made, tmp_path, monkeypatch, call):
     with monkeypatch.context() as patch:
         patch.setattr(os, call, full)
         with pytest.raises(InputError, match=r"No space left on device.*--resume$") as error:
-            run(out, "kitti", 5, 1, "--streets-of", 2)
+            run_simulate(out, "kitti", 5, 1, "--streets-of", 2)
     assert "\n" not in str(error.value)
     assert (out / "INCOMPLETE").exists() and not list(out.rglob(".*.tmp"))
-    assert run(out, "kitti", 5, 1, "--streets-of", 2, "--resume").exit_code == 0
-    assert content(out) == content(made / "kitti")
+    assert run_simulate(out, "kitti", 5, 1, "--streets-of", 2, "--resume").exit_code == 0
+    assert read_files(out) == read_files(simulated_data_sets / "kitti")
 
 
 def test_unwritable_file_ends_the_run(tmp_path):
     blocked = tmp_path / "set/training/velodyne/000003.bin"
-    run(tmp_path / "set", "kitti", 5, 1, "--streets-of", 5)
+    run_simulate(tmp_path / "set", "kitti", 5, 1, "--streets-of", 5)
     (tmp_path / "set/dataset.json").rename(tmp_path / "set/INCOMPLETE")  # .parts was already deleted
     blocked.unlink()
     blocked.mkdir()
     with pytest.raises(InputError, match=r"cannot write .*000003\.bin"):
-        run(tmp_path / "set", "kitti", 5, 1, "--streets-of", 5, "--resume")
+        run_simulate(tmp_path / "set", "kitti", 5, 1, "--streets-of", 5, "--resume")
     assert (tmp_path / "set/INCOMPLETE").exists()
 
 
-def test_existing_files_are_kept_without_force(made, tmp_path):
+def test_existing_files_are_kept_without_force(simulated_data_sets, tmp_path):
     out = tmp_path / "set"
-    assert run(out, "kitti", 2).exit_code == 0
-    before = content(out)
+    assert run_simulate(out, "kitti", 2).exit_code == 0
+    before = read_files(out)
     with pytest.raises(InputError, match="already exists"):
-        run(out, "kitti", 3)
+        run_simulate(out, "kitti", 3)
     with pytest.raises(InputError, match="other settings \\(frames 2, not 3"):
-        run(out, "kitti", 3, 1, "--resume")
-    assert content(out) == before
+        run_simulate(out, "kitti", 3, 1, "--resume")
+    assert read_files(out) == before
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/letter.txt").write_text("dear")
     for flag in ("--resume", "--force"):
         with pytest.raises(InputError, match="not a simulated data set"):
-            run(tmp_path / "mine", "kitti", 2, 1, flag)
-    assert content(tmp_path / "mine") == {"letter.txt": b"dear"}
+            run_simulate(tmp_path / "mine", "kitti", 2, 1, flag)
+    assert read_files(tmp_path / "mine") == {"letter.txt": b"dear"}
     with pytest.raises(InputError, match="is a file"):
-        run(tmp_path / "mine/letter.txt", "kitti", 2, 1, "--force")
+        run_simulate(tmp_path / "mine/letter.txt", "kitti", 2, 1, "--force")
     notes = out / "notes.txt"
     notes.write_text("dear")
     with pytest.raises(InputError, match=r"such as notes\.txt"):
-        run(out, "kitti", 2, 1, "--force")
-    assert content(out) == before | {"notes.txt": b"dear"}
+        run_simulate(out, "kitti", 2, 1, "--force")
+    assert read_files(out) == before | {"notes.txt": b"dear"}
     notes.unlink()
     (out / resumable_folder.RECORD_NAME).unlink()  # as after an interrupted --force
     (out / resumable_folder.INCOMPLETE_NAME).write_text("{}")
     with pytest.raises(InputError, match="start again with --force"):
-        run(out, "kitti", 2, 1, "--resume")
-    assert run(out, "semantickitti", 5, 1, "--streets-of", 2, "--force").exit_code == 0
-    assert content(out) == content(made / "semantickitti")
+        run_simulate(out, "kitti", 2, 1, "--resume")
+    assert run_simulate(out, "semantickitti", 5, 1, "--streets-of", 2, "--force").exit_code == 0
+    assert read_files(out) == read_files(simulated_data_sets / "semantickitti")
 
 
 def test_recorded_command_reproduces_data_set(tmp_path):
@@ -219,7 +225,7 @@ def test_recorded_command_reproduces_data_set(tmp_path):
     program, name, *options = shlex.split(command)
     assert (program, name) == ("lidar-perception", "simulate")
     invoke([*options, "--out", str(again), "--jobs", "1"])
-    assert content(again) == content(made)
+    assert read_files(again) == read_files(made)
 
 
 def test_run_with_changed_sensor_file_is_not_resumed(tmp_path):
@@ -237,14 +243,14 @@ def test_error_of_resume_names_every_difference(tmp_path, monkeypatch):
     out = tmp_path / "set"
     with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
         patch.setattr(dataset, "simulate_scan", lambda *_: 1 / 0)
-        run(out)
+        run_simulate(out)
     with pytest.raises(InputError, match=r"format 'kitti', not 'semantickitti'; streets_of 1") as e:
-        run(out, "semantickitti", 5, 1, "--resume")
+        run_simulate(out, "semantickitti", 5, 1, "--resume")
     assert "\n" not in str(e.value)
     (out / "INCOMPLETE").write_text("{")
     with pytest.raises(InputError, match="cannot read"):
-        run(out, "kitti", 5, 1, "--resume")
-    assert run(out, "kitti", 2, 1, "--force").exit_code == 0
+        run_simulate(out, "kitti", 5, 1, "--resume")
+    assert run_simulate(out, "kitti", 2, 1, "--force").exit_code == 0
 
 
 @pytest.mark.parametrize(

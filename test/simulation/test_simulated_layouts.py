@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from simulate_samples import TINY, run
+from simulate_samples import TINY, run_simulate
 
 from lidar_perception.data.kitti import write as write_kitti
 from lidar_perception.data.kitti.labels import read_object_labels, read_tracking_labels
@@ -52,8 +52,8 @@ def test_columns_of_scan_agree_with_points():
         assert points_in_box(xyz[on_object], box, margin=1.0).all()  # moving parts, mirrors, umbrellas
 
 
-def test_object_layout_is_read_as_written(made):
-    recording = open_recording(made / "kitti")
+def test_object_layout_is_read_as_written(simulated_data_sets):
+    recording = open_recording(simulated_data_sets / "kitti")
     assert len(recording) == 5
     for number, recorded in enumerate(recording):
         scan = simulate_scan(3 + number // 2, number % 2, TINY)
@@ -79,10 +79,10 @@ def test_hidden_objects_become_dont_care():
     assert [e["bbox"] for e in left_out] == [note["bbox"] for _, note in labels.notes]
 
 
-def test_tracking_layout_is_read_as_written(made):
-    frames = open_recording(made / "kitti-tracking").frames
+def test_tracking_layout_is_read_as_written(simulated_data_sets):
+    frames = open_recording(simulated_data_sets / "kitti-tracking").frames
     assert [f.name for f in frames] == ["0000/000000", "0000/000001", "0001/000000", "0001/000001", "0002/000000"]
-    for number, recorded in enumerate(open_recording(made / "kitti-tracking")):
+    for number, recorded in enumerate(open_recording(simulated_data_sets / "kitti-tracking")):
         scan = simulate_scan(3 + number // 2, number % 2, TINY)
         expected = make_kitti_labels(scan.truth)
         truth = recorded.truth()
@@ -106,8 +106,8 @@ def assert_same_objects(actual, expected, accuracy, truncation=None):
         assert np.allclose(a["bbox"], b["bbox"], atol=accuracy)
 
 
-def test_semantickitti_layout_is_read_as_written(made):
-    root = made / "semantickitti"
+def test_semantickitti_layout_is_read_as_written(simulated_data_sets):
+    root = simulated_data_sets / "semantickitti"
     frames = open_recording(root).frames
     assert [f.name for f in frames] == ["00/000000", "00/000001", "01/000000", "01/000001", "02/000000"]
     for number, frame in enumerate(frames):
@@ -135,7 +135,7 @@ def test_semantickitti_layout_is_read_as_written(made):
 )
 def test_sensor_height_is_kept_in_every_layout(tmp_path, layout, inner):
     low = tmp_path / "low"
-    assert run(low, layout, 2, 1, "--mount-height", 0.6).exit_code == 0
+    assert run_simulate(low, layout, 2, 1, "--mount-height", 0.6).exit_code == 0
     for path in (low, low / inner):
         recording = open_recording(path)
         assert recording.has_sensor_height and {frame.sensor_height for frame in recording} == {0.6}
@@ -152,7 +152,7 @@ def test_sensor_height_is_kept_in_every_layout(tmp_path, layout, inner):
 
 
 def test_bag_contains_consecutive_streets(tmp_path):
-    result = run(tmp_path / "bag", "mcap", 4, 1, "--streets-of", 2)
+    result = run_simulate(tmp_path / "bag", "mcap", 4, 1, "--streets-of", 2)
     assert result.exit_code == 0, result.output
     recording = list(open_recording(tmp_path / "bag"))
     for number, recorded in enumerate(recording):

@@ -20,13 +20,13 @@ EXACT = replace(COARSE, range_noise=0.0, dropout=0.0, divergence=0.0)
 pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("streets")]  # covered by other tests
 
 
-def street(seed):
+def make_street(seed):
     return drives._make_cached_scene(seed, ALL_STREETS)
 
 
 def scan(seed, t, sensor=COARSE):
     """Return scene, its state after t seconds, hits, and xyz and owner of the returns."""
-    scene = street(seed)
+    scene = make_street(seed)
     state = scene.compute_state(t, sensor.height)
     hits = cast_rays(state.solids, scene.ground, state.position, sensor)
     xyz, _, owner, *_ = make_returns(hits, sensor, NO_MOTION, np.random.default_rng(0))
@@ -89,7 +89,7 @@ def test_points_of_object_are_in_its_box(seed, t):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_boxes_stand_on_ground_without_overlap(seed):
-    scene = street(seed)
+    scene = make_street(seed)
     for t in (0.0, 2.0, 10.0, 19.9):
         state = scene.compute_state(t, 1.73)
         world = state.boxes[:, :3] + state.position

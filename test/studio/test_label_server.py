@@ -104,13 +104,13 @@ def run_on_page(url, use_page):
 
 
 @pytest.fixture(scope="module")
-def server_url(written, tmp_path_factory):
+def server_url(sample_bag, tmp_path_factory):
     """Address of a server that is shared by several tests, so its labels are arbitrary."""
-    with run_server(*make_label_arguments(written, tmp_path_factory.mktemp("labels"))) as server:
+    with run_server(*make_label_arguments(sample_bag, tmp_path_factory.mktemp("labels"))) as server:
         yield server.url
 
 
-def test_cloud_has_all_columns_in_a_fixed_random_order(server_url, written):
+def test_cloud_has_all_columns_in_a_fixed_random_order(server_url, sample_bag):
     from lidar_perception.data.open import open_recording
 
     async def use_page(page):
@@ -124,7 +124,7 @@ def test_cloud_has_all_columns_in_a_fixed_random_order(server_url, written):
         return first_body
 
     body = run_on_page(server_url, use_page)
-    frame = list(open_recording(written))[1].load()
+    frame = list(open_recording(sample_bag))[1].load()
     n = int(np.frombuffer(body, np.uint32, 1, 4)[0])
     assert body[:4] == b"LPC1" and n == len(frame)
     xyz = np.frombuffer(body, np.float32, 3 * n, 8).reshape(-1, 3)
@@ -278,22 +278,22 @@ def test_event_after_the_server_has_ended_is_ignored():
 
 
 @pytest.mark.no_cover
-def test_killed_server_loses_no_labels(written, tmp_path):
+def test_killed_server_loses_no_labels(sample_bag, tmp_path):
     async def edit(page):
         await page.send_action(**ADD)
         await page.send_action(do="box", track=1, frame=2, box=BOX)
         await page.send_action(do="undo")
         return await page.get_json("/api/state")
 
-    with run_server(*make_label_arguments(written, tmp_path)) as server:
+    with run_server(*make_label_arguments(sample_bag, tmp_path)) as server:
         before = run_on_page(server.url, edit)
-        command = make_command_line(*make_label_arguments(written, tmp_path))
+        command = make_command_line(*make_label_arguments(sample_bag, tmp_path))
         second_server = subprocess.run(command, text=True, capture_output=True)
         assert second_server.returncode == 2 and "another process" in second_server.stderr
         server.process.kill()
     with open(tmp_path / "journal.jsonl", "a") as journal:
         journal.write('{"seq": 4, "do": "re')
-    with run_server(*make_label_arguments(written, tmp_path)) as server:
+    with run_server(*make_label_arguments(sample_bag, tmp_path)) as server:
         assert run_on_page(server.url, lambda page: page.get_json("/api/state")) == before
         assert run_on_page(server.url, lambda page: page.send_action(do="redo")) == {"seq": 4}
         os.kill(server.process.pid, signal.SIGINT)
@@ -307,7 +307,7 @@ def limit_file_size():
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
 
 
-def test_full_disk_is_reported_and_labels_match_the_journal(written, tmp_path):
+def test_full_disk_is_reported_and_labels_match_the_journal(sample_bag, tmp_path):
     async def fill(page):
         for _ in range(50):
             before = await page.get_json("/api/state")
@@ -318,15 +318,15 @@ def test_full_disk_is_reported_and_labels_match_the_journal(written, tmp_path):
                     return before
         raise AssertionError("the disk was never full")
 
-    with run_server(*make_label_arguments(written, tmp_path), before=limit_file_size) as server:
+    with run_server(*make_label_arguments(sample_bag, tmp_path), before=limit_file_size) as server:
         before = run_on_page(server.url, fill)
     assert len(before["tracks"]) > 3
-    with run_server(*make_label_arguments(written, tmp_path)) as server:
+    with run_server(*make_label_arguments(sample_bag, tmp_path)) as server:
         assert run_on_page(server.url, lambda page: page.get_json("/api/state")) == before
 
 
 @pytest.mark.no_cover
-def test_exported_labels_are_imported_unchanged(written, tmp_path):
+def test_exported_labels_are_imported_unchanged(sample_bag, tmp_path):
     async def make(page):
         await page.send_action(**ADD)
         await page.send_action(do="box", track=1, frame=2, box=BOX)
@@ -344,11 +344,11 @@ def test_exported_labels_are_imported_unchanged(written, tmp_path):
                 assert reply.status == 400 and (await reply.json())["error"]
         return first, await page.get_json("/api/state")
 
-    with run_server(*make_label_arguments(written, tmp_path / "one")) as server:
+    with run_server(*make_label_arguments(sample_bag, tmp_path / "one")) as server:
         result, state = run_on_page(server.url, make)
     assert result["boxes"] == 4 and result["frames"] == 3
     import_options = ["--import", f"openlabel:{result['path']}"]
-    with run_server(*make_label_arguments(written, tmp_path / "two", *import_options)) as server:
+    with run_server(*make_label_arguments(sample_bag, tmp_path / "two", *import_options)) as server:
         imported_state = run_on_page(server.url, lambda page: page.get_json("/api/state"))
         assert {(t["class"], tuple(map(tuple, (b[:8] for b in t["boxes"])))) for t in imported_state["tracks"]} == {
             (t["class"], tuple(map(tuple, (b[:8] for b in t["boxes"])))) for t in state["tracks"]
@@ -357,16 +357,16 @@ def test_exported_labels_are_imported_unchanged(written, tmp_path):
         assert run_on_page(server.url, lambda page: page.get_json("/api/state"))["tracks"] == []
 
 
-def test_labels_of_the_drive_are_shown_only_on_request(server_url, written, tmp_path):
+def test_labels_of_the_drive_are_shown_only_on_request(server_url, sample_bag, tmp_path):
     assert run_on_page(server_url, lambda page: page.get_json("/api/labels/0"))["labels"] == []
-    with run_server(*make_label_arguments(written, tmp_path, "--show-labels")) as server:
+    with run_server(*make_label_arguments(sample_bag, tmp_path, "--show-labels")) as server:
         results = run_on_page(server.url, lambda page: page.get_json("/api/labels/0"))
         ((*box, name, _),) = results["labels"]
         assert np.allclose(box, WALKER) and name == "Pedestrian"
         assert run_on_page(server.url, lambda page: page.get_json("/api/labels/1"))["labels"] == []
 
 
-def test_drive_is_surveyed_once_in_the_background(written, tmp_path):
+def test_drive_is_surveyed_once_in_the_background(sample_bag, tmp_path):
     async def wait(page):
         async with page.http.ws_connect(f"{page.base}/api/events") as events:
             state = await page.get_json("/api/state")
@@ -379,7 +379,9 @@ def test_drive_is_surveyed_once_in_the_background(written, tmp_path):
     before = None
     for _ in range(2):  # the second server reads the proposals from the journal
         with subprocess.Popen(
-            make_command_line(*make_label_arguments(written, tmp_path, "--propose")), text=True, stdout=subprocess.PIPE
+            make_command_line(*make_label_arguments(sample_bag, tmp_path, "--propose")),
+            text=True,
+            stdout=subprocess.PIPE,
         ) as process:
             try:
                 state = run_on_page(process.stdout.readline().strip(), wait)

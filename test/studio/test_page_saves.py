@@ -105,10 +105,10 @@ def test_outdated_server_state_does_not_revert_edits(browser, page, labels, pers
         if len(states) == 1:
             route.fulfill(response=states[0][1])
 
-    def held(page):
+    def hold_state(page):
         page.route("**/api/state*", reply)
 
-    with open_page(browser, labels.url, held) as other:
+    with open_page(browser, labels.url, hold_state) as other:
         while len(states) < 2:  # one when the page opens, one when it subscribes
             other.wait_for_timeout(10)
         page.keyboard.press("3")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_samples import exit_of
+from cli_samples import run_main
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
@@ -38,11 +38,11 @@ VAN = CLASSES.index("Van")
 CARS = np.array([[10.0, 0, -1, 4, 1.6, 1.5, 0.3], [20.0, 4, -1, 4, 1.6, 1.5, 2.0]])
 
 
-def truth(boxes, class_ids):
+def make_truth(boxes, class_ids):
     return GroundTruth.of(boxes, class_ids)
 
 
-def wrong(*arguments, **more):
+def find_errors(*arguments, **more):
     """Return missed and false rows, and check that every row is counted once."""
     truth, found, least, *_ = arguments
     result = match_detections(*arguments, **more)
@@ -56,27 +56,27 @@ def test_exact_detections_have_no_errors():
     boxes = np.vstack([CARS, [[8.0, -3, -1, 0.6, 0.6, 1.7, 0]]])
     found = Detections.of(boxes, ids, [0.9, 0.4, 0.7])
     for order in ([0, 1, 2], [2, 0, 1]):
-        assert wrong(truth(boxes[order], np.array(ids)[order]), found, 0.0) == {"missed": [], "false": []}
+        assert find_errors(make_truth(boxes[order], np.array(ids)[order]), found, 0.0) == {"missed": [], "false": []}
 
 
 def test_detection_below_the_minimum_score_is_ignored():
     found = Detections.of(CARS, CAR, [0.9, 0.4])
-    assert wrong(truth(CARS, [CAR, CAR]), found, 0.5) == {"missed": [1], "false": []}
-    assert wrong(truth(CARS[:1], [CAR]), found, 0.0) == {"missed": [], "false": [1]}
+    assert find_errors(make_truth(CARS, [CAR, CAR]), found, 0.5) == {"missed": [1], "false": []}
+    assert find_errors(make_truth(CARS[:1], [CAR]), found, 0.0) == {"missed": [], "false": [1]}
 
 
 def test_duplicate_and_wrong_class_are_false_positives():
     found = Detections.of(np.vstack([CARS[:1], CARS[:1]]), CAR, [0.9, 0.8])
-    assert wrong(truth(CARS[:1], [CAR]), found, 0.0)["false"] in ([0], [1])
+    assert find_errors(make_truth(CARS[:1], [CAR]), found, 0.0)["false"] in ([0], [1])
     other = Detections.of(CARS[:1], PEDESTRIAN, 0.9)
-    assert wrong(truth(CARS[:1], [CAR]), other, 0.0) == {"missed": [0], "false": [0]}
+    assert find_errors(make_truth(CARS[:1], [CAR]), other, 0.0) == {"missed": [0], "false": [0]}
 
 
 def test_detected_van_is_not_an_error():
-    assert wrong(truth(CARS[:1], [VAN]), Detections.none(), 0.0) == {"missed": [], "false": []}
+    assert find_errors(make_truth(CARS[:1], [VAN]), Detections.none(), 0.0) == {"missed": [], "false": []}
     found = Detections.of(CARS[:1], CAR, 0.9)
-    assert wrong(truth(CARS[:1], [VAN]), found, 0.0) == {"missed": [], "false": []}
-    result = match_detections(truth(CARS, [CAR, VAN]), Detections.of(CARS, CAR, 0.9), 0.0)
+    assert find_errors(make_truth(CARS[:1], [VAN]), found, 0.0) == {"missed": [], "false": []}
+    result = match_detections(make_truth(CARS, [CAR, VAN]), Detections.of(CARS, CAR, 0.9), 0.0)
     assert (result["ignored_labels"], result["ignored"]) == ([1], [1])
 
 
@@ -90,8 +90,8 @@ def test_every_label_and_detection_is_counted_once(labels, detections, classes):
         return np.array([[3.0 * place, 2, -1, 4, 1.6, 1.5, 0] for place, *_ in rows]).reshape(-1, 7)
 
     kinds = CAR, VAN, PEDESTRIAN, CLASSES.index("Tram")
-    wrong(
-        truth(boxes(labels), [kinds[k] for _, k in labels]),
+    find_errors(
+        make_truth(boxes(labels), [kinds[k] for _, k in labels]),
         Detections.of(boxes(detections), [kinds[k] for _, k, _ in detections], [score / 4 for *_, score in detections]),
         0.5,
         classes=classes,
@@ -121,7 +121,7 @@ NUMBERS = st.lists(st.integers(-(2**31), 2**31 - 1), min_size=1, max_size=6, uni
 def test_tracks_of_different_trackers_have_distinct_ids(trackers, far):
     trackers[1] = [*{*trackers[1], *(n + far for n in trackers[0] if n + far < 2**31)}]
     made = [
-        [t["id"] for t in tracks_to_json({0: marked(numbers)}, "/a/output/tracks", k)]
+        [t["id"] for t in tracks_to_json({0: make_marked_objects(numbers)}, "/a/output/tracks", k)]
         for k, numbers in enumerate(trackers)
     ]
     all_ids = [number for each in made for number in each]
@@ -131,12 +131,12 @@ def test_tracks_of_different_trackers_have_distinct_ids(trackers, far):
 
 
 def test_track_has_the_last_class_of_its_tracker():
-    first, then = marked([7]), replace(marked([7]), labels=["Cyclist"])
+    first, then = make_marked_objects([7]), replace(make_marked_objects([7]), labels=["Cyclist"])
     (track,) = tracks_to_json({0: first, 1: then}, "/a/output/tracks", 0)
     assert track["class"] == "Cyclist" and len(track["boxes"]) == 2
 
 
-def marked(numbers):
+def make_marked_objects(numbers):
     count = len(numbers)
     return MarkedObjects(
         np.tile([5.0, 0, 0, 1, 1, 1, 0], (count, 1)),
@@ -208,7 +208,7 @@ def test_file_without_a_cloud_is_rejected_before_serving(verb, content, tmp_path
     file = tmp_path / "text.pcd"
     file.write_bytes(content)
     monkeypatch.chdir(tmp_path)
-    assert exit_of(monkeypatch, verb, file, "--no-open") == 2
+    assert run_main(monkeypatch, verb, file, "--no-open") == 2
     output = capsys.readouterr()
     assert str(file) in output.err.splitlines()[-1] and "http" not in output.out
     assert not (tmp_path / "out").exists()

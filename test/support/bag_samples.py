@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from rosbags.convert.converter import convert
 from rosbags.typesys import Stores, get_typestore
-from samples import CALIBRATION, STAMP, scene, walker_truth
+from samples import CALIBRATION, STAMP, make_scene, make_walker_truth
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.bag import Bag
@@ -26,8 +26,8 @@ def scans(count: int = 3) -> list[Frame]:
     return [
         Frame.of(
             str(i),
-            cloud_frame(scene(i), STAMP + i * 10**8),
-            None if i == 1 else walker_truth(),
+            cloud_frame(make_scene(i), STAMP + i * 10**8),
+            None if i == 1 else make_walker_truth(),
             CALIBRATION if i < 2 else OTHER_CALIBRATION,
         )
         for i in range(count)

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from lidar_perception.cli.main import cli, main
 
 
-def exit_of(monkeypatch, *arguments, run=main) -> int:
+def run_main(monkeypatch, *arguments, run=main) -> int:
     """Return the exit code of `lidar-perception ARGUMENTS`, run in this process."""
     monkeypatch.setattr(sys, "argv", ["lidar-perception", *map(str, arguments)])
     try:
@@ -21,7 +21,7 @@ def exit_of(monkeypatch, *arguments, run=main) -> int:
     return 0
 
 
-def run(*arguments) -> str:
+def run_command(*arguments) -> str:
     """Return the standard output of a command that succeeds."""
     result = CliRunner().invoke(cli, [str(a) for a in arguments], catch_exceptions=False)
     assert result.exit_code == 0, result.output
@@ -31,15 +31,15 @@ def run(*arguments) -> str:
 def evaluate(tmp_path, *arguments) -> dict:
     """Return the JSON file of `evaluate candidates`."""
     path = tmp_path / "made/by/evaluate/scores.json"
-    run("evaluate", "candidates", "--json", path, *arguments)
+    run_command("evaluate", "candidates", "--json", path, *arguments)
     return json.loads(path.read_text())
 
 
-def given(*assignments) -> list[str]:
+def make_set_options(*assignments) -> list[str]:
     return [word for each in assignments for word in ("--set", each)]
 
 
-def scores(content: dict) -> dict:
+def drop_times(content: dict) -> dict:
     """Return the scores without the run time."""
     return {k: v for k, v in content.items() if k != "ms"}
 
@@ -54,7 +54,7 @@ def evaluate_detection(tmp_path, *arguments):
     return json.loads(path.read_text()), result.stdout
 
 
-def error_line(capsys) -> str:
+def read_error_line(capsys) -> str:
     """Return the error line on stderr.
 
     Lines about the opened recording and compilation, and empty lines may come before it.

@@ -7,7 +7,7 @@ import zlib
 
 import numpy as np
 import zstandard
-from samples import STAMP, header
+from samples import STAMP, make_any_header
 
 from lidar_perception.wire.clouds import COMPRESSED
 from lidar_perception.wire.codec import make_bag_message
@@ -46,7 +46,7 @@ def livox_message(
     ]
     return make_bag_message(
         f"{package}/msg/CustomMsg",
-        header=header(make_bag_message, stamp_ns, frame_id),
+        header=make_any_header(make_bag_message, stamp_ns, frame_id),
         timebase=stamp_ns,
         point_num=len(rows),
         lidar_id=1,
@@ -56,7 +56,7 @@ def livox_message(
 
 def compressed_message(points: np.ndarray, packing: str, stamp_ns: int = STAMP):
     """CompressedPointCloud2 of rosbags' class, of a structured array; gzip is a kind of zlib."""
-    cloud = from_array(points, header(make_bag_message, stamp_ns), make_bag_message)
+    cloud = from_array(points, make_any_header(make_bag_message, stamp_ns), make_bag_message)
     packed = COMPRESS[packing](cloud.data.tobytes())
     return make_bag_message(
         COMPRESSED,

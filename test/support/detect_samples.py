@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass, replace
 
 import numpy as np
-from cli_samples import error_line, exit_of
+from cli_samples import read_error_line, run_main
 
 from lidar_perception.detecting.formats import Run
 from lidar_perception.detectors.contract import DetectionResult
@@ -60,20 +60,20 @@ class MadeDetector:
         return DetectionResult(detections[detections.scores >= self.params.least], problem=problem)
 
 
-def opened(path="", device="auto"):
+def load_made_detector(path="", device="auto"):
     """Load the detector, like the loaders in detectors.open.LOAD."""
     return MadeDetector()
 
 
 def detect(monkeypatch, *arguments):
     """Return the exit code of `detect --weights made ARGUMENTS`."""
-    return exit_of(monkeypatch, "detect", "--weights", NAME, *arguments)
+    return run_main(monkeypatch, "detect", "--weights", NAME, *arguments)
 
 
-def refused(monkeypatch, capsys, *arguments):
+def detect_with_error(monkeypatch, capsys, *arguments):
     """Return the error line of an invalid call."""
     assert detect(monkeypatch, *arguments) == 2
-    return error_line(capsys)
+    return read_error_line(capsys)
 
 
 def read_json(out):
@@ -84,7 +84,7 @@ def read_json(out):
     return content
 
 
-def objects(content):
+def list_objects(content):
     """Return {frame: rows of numbers of its objects}."""
     return {
         frame["name"]: [

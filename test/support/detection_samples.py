@@ -23,7 +23,7 @@ BOXES = torch.tensor([[6.0, 1.5, -0.95, 3.9, 1.7, 1.5, 1.2], [3.0, -2.5, -0.86, 
 LABELS = torch.tensor([0, 1])
 
 
-def tiny(version: str = "v0", **changes) -> NetworkConfig:
+def make_tiny_config(version: str = "v0", **changes) -> NetworkConfig:
     """Return the configuration of a version with 32 x 32 pillars and few channels."""
     small = dict(
         low=(0.0, -5.12, -3.0),
@@ -39,12 +39,12 @@ def tiny(version: str = "v0", **changes) -> NetworkConfig:
     return make_config(version, "compact", **{**small, **changes})
 
 
-def anchor_tensors(config: NetworkConfig) -> tuple[torch.Tensor, torch.Tensor]:
+def make_anchor_tensors(config: NetworkConfig) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the anchors (A, 7) of a network and their classes (A,)."""
     return torch.from_numpy(make_anchors(config)), torch.from_numpy(get_anchor_classes(config))
 
 
-def two_objects(seed: int = 0) -> np.ndarray:
+def make_two_objects(seed: int = 0) -> np.ndarray:
     """Return flat ground with the surfaces of BOXES on it, (N, 4) float32 [x y z intensity]."""
     rng = np.random.default_rng(seed)
     parts = [rng.uniform([0, -5, -1.74], [10, 5, -1.72], (3000, 3))]
@@ -63,7 +63,7 @@ def two_objects(seed: int = 0) -> np.ndarray:
     return np.column_stack([xyz, rng.uniform(0, 1, len(xyz))]).astype(np.float32)
 
 
-def lively(config, seed=0) -> torch.nn.Module:
+def make_random_network(config, seed=0) -> torch.nn.Module:
     """Return a network in eval mode whose norms and head differ from their initial values."""
     torch.manual_seed(seed)
     network = make_network(config).eval()
@@ -79,15 +79,17 @@ def lively(config, seed=0) -> torch.nn.Module:
     return network.requires_grad_(False)
 
 
-def frame(seed: int = 0) -> PointCloud:
+def make_scan(seed: int = 0) -> PointCloud:
     """Return a frame with the two objects, and points behind the sensor and far away."""
-    points = two_objects(seed)
+    points = make_two_objects(seed)
     points = np.concatenate([points, points[::7] * [-1, 1, 1, 1], points[::9] + [50, 0, 0, 0]])
     points = points.astype(np.float32)
     return PointCloud(np.ascontiguousarray(points[:, :3]), points[:, 3].copy())
 
 
-def eager(params: DetectorParams = DetectorParams(), score: float = 0.25, engine: str = "auto") -> DetectorParams:
+def lower_thresholds(
+    params: DetectorParams = DetectorParams(), score: float = 0.25, engine: str = "auto"
+) -> DetectorParams:
     """Return parameters with which random weights detect something."""
     names = ("car", "pedestrian", "cyclist", "other")
     return with_values(
@@ -100,10 +102,12 @@ def eager(params: DetectorParams = DetectorParams(), score: float = 0.25, engine
     )
 
 
-def random_detector(version: str = "v0", params: DetectorParams | None = None, **changes) -> PointPillarsDetector:
+def make_random_detector(version: str = "v0", params: DetectorParams | None = None, **changes) -> PointPillarsDetector:
     """Return a PointPillars detector with random weights."""
     return make_detector(
-        TorchNetwork(lively(tiny(version, **changes))), Header(tiny(version, **changes)), params or eager()
+        TorchNetwork(make_random_network(make_tiny_config(version, **changes))),
+        Header(make_tiny_config(version, **changes)),
+        params or lower_thresholds(),
     )
 
 
@@ -113,7 +117,7 @@ def make_detector(
     return PointPillarsDetector(PointPillarsProposer(network, header, device), params)
 
 
-def same(a: Detections | DetectionResult, b: Detections | DetectionResult, atol: float = 0.0) -> bool:
+def are_equal_detections(a: Detections | DetectionResult, b: Detections | DetectionResult, atol: float = 0.0) -> bool:
     """Return True if the detections are equal and in the same order."""
     a, b = (x.detections if isinstance(x, DetectionResult) else x for x in (a, b))
     return (

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pointnet_samples
-from detection_samples import eager, frame, lively, tiny
-from ros_samples import cloud
+from detection_samples import lower_thresholds, make_random_network, make_scan, make_tiny_config
+from ros_samples import make_ros_cloud
 
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.detectors.fused.detector import load_fused_detector
@@ -96,16 +96,16 @@ class DetectorUnderTest:
 def small_v4(folder: Path) -> Path:
     """Write random weights of a small v4 that detects something."""
     path = folder / "v4.safetensors"
-    save_checkpoint(path, lively(tiny("v4")), Header(tiny("v4")))
+    save_checkpoint(path, make_random_network(make_tiny_config("v4")), Header(make_tiny_config("v4")))
     return path
 
 
-def message(stamp, **columns):
+def make_scan_message(stamp, **columns):
     """Return the scan of detection_samples with additional columns."""
-    return make_cloud_message(np.column_stack([frame().xyz, frame().intensity]), stamp, **columns)
+    return make_cloud_message(np.column_stack([make_scan().xyz, make_scan().intensity]), stamp, **columns)
 
 
-def received(messages, stamp):
+def find_received(messages, stamp):
     """Return the received detections of the cloud with this stamp, or None."""
     return next((m for m in map(from_marker_array, messages) if m.stamp_ns == stamp), None)
 
@@ -123,8 +123,8 @@ def assert_equal(objects, expected):
 def small_pointnet(folder: Path) -> Path:
     """Write random weights of a small PointNet that detects something."""
     path = folder / "pointnet.safetensors"
-    config = pointnet_samples.small()
-    save_checkpoint(path, pointnet_samples.lively(config), Header(config))
+    config = pointnet_samples.make_small_config()
+    save_checkpoint(path, pointnet_samples.make_random_network(config), Header(config))
     return path
 
 
@@ -136,46 +136,52 @@ def small_fusion(folder: Path) -> Path:
 
 
 def _pointpillars_clouds():
-    xyz, rng = frame().xyz, np.random.default_rng(0)
+    xyz, rng = make_scan().xyz, np.random.default_rng(0)
     count = np.zeros(len(xyz))
     return {
-        "one point": (cloud([[5, 0, -1]]), "no intensity"),
-        "out of range": (cloud(xyz + [500, 0, 0]), "network's range"),
-        "behind": (cloud(np.abs(xyz) * [-1, 1, -1] - [1, 0, 0]), "network's range"),
-        "no intensity": (cloud(xyz), "no intensity"),
-        "a million": (cloud(rng.uniform(-50, 50, (1_000_000, 3)) * [1, 1, 0.05]), "no intensity"),
-        "some NaN": (cloud(np.where(np.arange(len(xyz))[:, None] % 3, xyz, np.nan)), "no intensity"),
-        "all is ground": (message(1, ground=count.astype("u1") + 1), "are ground"),
-        "no clusters": (message(1, ground=count.astype("u1"), cluster_id=count.astype("u4")), "detecting"),
+        "one point": (make_ros_cloud([[5, 0, -1]]), "no intensity"),
+        "out of range": (make_ros_cloud(xyz + [500, 0, 0]), "network's range"),
+        "behind": (make_ros_cloud(np.abs(xyz) * [-1, 1, -1] - [1, 0, 0]), "network's range"),
+        "no intensity": (make_ros_cloud(xyz), "no intensity"),
+        "a million": (make_ros_cloud(rng.uniform(-50, 50, (1_000_000, 3)) * [1, 1, 0.05]), "no intensity"),
+        "some NaN": (make_ros_cloud(np.where(np.arange(len(xyz))[:, None] % 3, xyz, np.nan)), "no intensity"),
+        "all is ground": (make_scan_message(1, ground=count.astype("u1") + 1), "are ground"),
+        "no clusters": (make_scan_message(1, ground=count.astype("u1"), cluster_id=count.astype("u4")), "detecting"),
         "ids beyond int32": (
-            message(1, cluster_id=(count + 2**32 - 1).astype("u4"), ground=count.astype("u1")),
+            make_scan_message(1, cluster_id=(count + 2**32 - 1).astype("u4"), ground=count.astype("u1")),
             "detecting",
         ),
-        "large ids": (message(1, cluster_id=(count + 2**31 - 1).astype("u4")), "detecting"),
-        "float columns": (message(1, cluster_id=count * np.nan, ground=count * np.nan), "detecting"),
-        "two values per point": (message(1, ground=np.zeros((len(xyz), 2), "u1")), "'ground' has count > 1"),
+        "large ids": (make_scan_message(1, cluster_id=(count + 2**31 - 1).astype("u4")), "detecting"),
+        "float columns": (make_scan_message(1, cluster_id=count * np.nan, ground=count * np.nan), "detecting"),
+        "two values per point": (make_scan_message(1, ground=np.zeros((len(xyz), 2), "u1")), "'ground' has count > 1"),
     }
 
 
 def _pointnet_clouds():
-    count = np.zeros(len(frame()))
+    count = np.zeros(len(make_scan()))
     return {
-        "one point": (cloud([[5, 0, -1]]), "no clusters"),
-        "all is ground": (message(1, ground=count.astype("u1") + 1), "no clusters"),
-        "no clusters": (message(1, cluster_id=count.astype("u4")), "no clusters"),
-        "clusters of one point": (message(1, cluster_id=np.arange(len(count), dtype="u4")), "fewer than 3 points"),
-        "ids beyond int32": (message(1, cluster_id=(count + 2**32 - 1).astype("u4")), "no clusters"),
-        "one large cluster": (message(1, cluster_id=(count + 2**31 - 1).astype("u4")), "detecting"),
-        "float column": (message(1, cluster_id=count * np.nan), "no clusters"),
-        "no intensity": (cloud(frame().xyz), "no intensity"),
-        "two values per point": (message(1, cluster_id=np.zeros((len(count), 2), "u4")), "'cluster_id' has count > 1"),
+        "one point": (make_ros_cloud([[5, 0, -1]]), "no clusters"),
+        "all is ground": (make_scan_message(1, ground=count.astype("u1") + 1), "no clusters"),
+        "no clusters": (make_scan_message(1, cluster_id=count.astype("u4")), "no clusters"),
+        "clusters of one point": (
+            make_scan_message(1, cluster_id=np.arange(len(count), dtype="u4")),
+            "fewer than 3 points",
+        ),
+        "ids beyond int32": (make_scan_message(1, cluster_id=(count + 2**32 - 1).astype("u4")), "no clusters"),
+        "one large cluster": (make_scan_message(1, cluster_id=(count + 2**31 - 1).astype("u4")), "detecting"),
+        "float column": (make_scan_message(1, cluster_id=count * np.nan), "no clusters"),
+        "no intensity": (make_ros_cloud(make_scan().xyz), "no intensity"),
+        "two values per point": (
+            make_scan_message(1, cluster_id=np.zeros((len(count), 2), "u4")),
+            "'cluster_id' has count > 1",
+        ),
     }
 
 
 def _fused_clouds():
     return {
-        "out of range": (cloud(frame().xyz + [500, 0, 0]), "network's range"),
-        "all is ground": (message(1, ground=np.ones(len(frame()), "u1")), "are ground"),
+        "out of range": (make_ros_cloud(make_scan().xyz + [500, 0, 0]), "network's range"),
+        "all is ground": (make_scan_message(1, ground=np.ones(len(make_scan()), "u1")), "are ground"),
     }
 
 
@@ -183,7 +189,7 @@ POINTPILLARS_NODE = DetectorUnderTest(
     "pointpillars_detector",
     build_graph(["pointpillars"]),
     CONFIG / "pointpillars.param.yaml",
-    eager(),
+    lower_thresholds(),
     load_detector,
     small_v4,
     POINTPILLARS_STEPS,
@@ -194,7 +200,7 @@ POINTNET_NODE = DetectorUnderTest(
     "pointnet_detector",
     build_graph(["pointnet"]),
     CONFIG / "pointnet.param.yaml",
-    pointnet_samples.eager(),
+    pointnet_samples.accept_every_cluster(),
     load_pointnet_detector,
     small_pointnet,
     POINTNET_STEPS,

@@ -22,7 +22,7 @@ def count_points(frames, number):
     return {"frame": frames[number].name, "points": len(frames[number].load()), "before": before}
 
 
-def points_table(records):
+def make_sections(records):
     rows = tuple((r["frame"], Cell(r["points"], paper=7, digits=0)) for r in records if "skipped" not in r)
     curve = Line("points | all", range(len(rows)), [row[1].value for row in rows])
     return [
@@ -35,21 +35,21 @@ def points_table(records):
     ]
 
 
-def small(measure=count_points, **settings):
-    return Experiment("small", "Small & <quick>", "How many?", measure, points_table, settings)
+def make_small_experiment(measure=count_points, **settings):
+    return Experiment("small", "Small & <quick>", "How many?", measure, make_sections, settings)
 
 
-SMALL = small()
+SMALL = make_small_experiment()
 
 
-def command(*arguments):
+def run_reproduce(*arguments):
     """Run `reproduce` and return its standard output; exceptions are raised."""
     result = CliRunner().invoke(cli, ["reproduce", *map(str, arguments)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result.stdout
 
 
-def untimed(folder):
+def read_untimed_records(folder):
     """Return the records in a folder without their times, in order."""
     head, *lines = (folder / journal.JOURNAL_NAME).read_text().splitlines()
     assert "plan" in json.loads(head)

@@ -32,7 +32,7 @@ EXACT = {
 }
 
 
-def pose(i: int) -> np.ndarray:
+def make_sloped_pose(i: int) -> np.ndarray:
     """Return the pose of the LiDAR in frame i, on a slope."""
     yaw, pitch = 0.1 * i, 0.02
     about_z = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
@@ -42,7 +42,7 @@ def pose(i: int) -> np.ndarray:
     return matrix
 
 
-def drive(name: str, frames: int = 3, camera: bool = True) -> list[Frame]:
+def make_format_drive(name: str, frames: int = 3, camera: bool = True) -> list[Frame]:
     """Return frames of each sequence of a drive; numbers start at 5."""
     rng = np.random.default_rng(0)
     made = []
@@ -55,7 +55,7 @@ def drive(name: str, frames: int = 3, camera: bool = True) -> list[Frame]:
                     f"{sequence}/{i:06}",
                     PointCloud.of(xyz, None, stamp, "velodyne"),
                     calibration=CALIBRATION if camera else None,
-                    pose=pose(i).copy,
+                    pose=make_sloped_pose(i).copy,
                     sequence=sequence,
                     index=i,
                 )
@@ -93,7 +93,7 @@ def make_labels(frames: list[Frame], format: str, seed: int = 0) -> DriveLabels:
     return DriveLabels(found)
 
 
-def same(labels: DriveLabels, others: DriveLabels, tolerance: float) -> None:
+def assert_equal_labels(labels: DriveLabels, others: DriveLabels, tolerance: float) -> None:
     """Assert equal labels in any order, with boxes within the tolerance."""
     assert [f.name for f in labels.frames] == [f.name for f in others.frames]
     assert [f.stamp_ns for f in labels.frames] == [f.stamp_ns for f in others.frames]

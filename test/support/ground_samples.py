@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def street(seed=0, slope=(0.0, 0.0), count=30_000, reach=40.0):
+def make_street(seed=0, slope=(0.0, 0.0), count=30_000, reach=40.0):
     """Return points of a sloped road with five cars and a wall, and (N,) bool, True = road."""
     rng = np.random.default_rng(seed)
     road = np.column_stack([rng.uniform(-reach, reach, (count, 2)), rng.normal(0, 0.02, count)])
@@ -22,5 +22,5 @@ def street(seed=0, slope=(0.0, 0.0), count=30_000, reach=40.0):
     return xyz.astype(np.float32), np.arange(len(xyz)) < len(road)
 
 
-def f1(found, truth):
+def compute_f1(found, truth):
     return 2 * (found & truth).sum() / (found.sum() + truth.sum())

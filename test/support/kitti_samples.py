@@ -9,12 +9,12 @@ from samples import (
     LIDAR_TO_CAMERA,
     RECTIFY,
     VELODYNE,
-    calibration_text,
-    header,
-    numbers,
-    object_folder,
-    scene,
-    write,
+    format_numbers,
+    make_any_header,
+    make_calibration_text,
+    make_scene,
+    write_file,
+    write_object_folder,
 )
 
 from lidar_perception.data.kitti.labels import format_label, to_labels
@@ -46,42 +46,42 @@ TRACKLETS = """\
 """
 
 
-def tracking_folder(root):
+def write_tracking_folder(root):
     for sequence, frames in (("0000", (0, 1, 2)), ("0007", (5, 6))):
         for i in frames:
-            write(root / f"training/velodyne/{sequence}/{i:06}.bin", scene(i).tobytes())
-        write(
-            root / f"training/calib/{sequence}.txt", calibration_text("R_rect", "Tr_velo_cam")
+            write_file(root / f"training/velodyne/{sequence}/{i:06}.bin", make_scene(i).tobytes())
+        write_file(
+            root / f"training/calib/{sequence}.txt", make_calibration_text("R_rect", "Tr_velo_cam")
         )  # without colons, as in KITTI's files
-    write(root / "training/label_02/0000.txt", TRACKING_LABELS)
+    write_file(root / "training/label_02/0000.txt", TRACKING_LABELS)
     return root
 
 
-def raw_folder(root):
+def write_raw_folder(root):
     day = root / "2011_09_26"
     drive = day / "2011_09_26_drive_0001_sync"
     for i in range(3):
-        write(drive / f"velodyne_points/data/{i:010}.bin", scene(i).tobytes())
-    write(
+        write_file(drive / f"velodyne_points/data/{i:010}.bin", make_scene(i).tobytes())
+    write_file(
         drive / "velodyne_points/timestamps.txt",
         "2011-09-26 13:02:25.594360375\n2011-09-26 13:02:25.7\n2011-09-26 13:02:26.000000001\n",
     )
-    write(drive / "tracklet_labels.xml", TRACKLETS)
-    write(
+    write_file(drive / "tracklet_labels.xml", TRACKLETS)
+    write_file(
         day / "calib_cam_to_cam.txt",
         "calib_time: 09-Jan-2012 13:57:47\n"
-        f"S_rect_02: 1.242e+03 3.75e+02\nR_rect_00: {numbers(RECTIFY)}\n"
-        f"P_rect_02: {numbers(INTRINSICS)}\n",
+        f"S_rect_02: 1.242e+03 3.75e+02\nR_rect_00: {format_numbers(RECTIFY)}\n"
+        f"P_rect_02: {format_numbers(INTRINSICS)}\n",
     )
-    write(
+    write_file(
         day / "calib_velo_to_cam.txt",
         "calib_time: 15-Mar-2012 11:37:16\n"
-        f"R: {numbers(VELODYNE[:, :3])}\nT: {numbers(VELODYNE[:, 3])}\ndelta_f: 0 0\n",
+        f"R: {format_numbers(VELODYNE[:, :3])}\nT: {format_numbers(VELODYNE[:, 3])}\ndelta_f: 0 0\n",
     )
     return root
 
 
-LAYOUTS = {"object": object_folder, "tracking": tracking_folder, "raw": raw_folder}
+LAYOUTS = {"object": write_object_folder, "tracking": write_tracking_folder, "raw": write_raw_folder}
 each_layout = pytest.mark.parametrize("layout", LAYOUTS)
 
 
@@ -89,12 +89,12 @@ def format_truth(truth: GroundTruth) -> list[str]:
     return [format_label(label) for label in to_labels(truth, LIDAR_TO_CAMERA)]
 
 
-def through_markers(truth: GroundTruth) -> GroundTruth:
-    raw = encode(make_truth_markers(truth, header(make_bag_message), make_bag_message))
+def pass_through_markers(truth: GroundTruth) -> GroundTruth:
+    raw = encode(make_truth_markers(truth, make_any_header(make_bag_message), make_bag_message))
     return to_truth(from_marker_array(decode(raw, "visualization_msgs/msg/MarkerArray")))
 
 
-def same(a: GroundTruth, b: GroundTruth) -> bool:
+def are_equal_truths(a: GroundTruth, b: GroundTruth) -> bool:
     yaw_difference = np.abs((a.boxes[:, 6] - b.boxes[:, 6] + np.pi) % (2 * np.pi) - np.pi)
     return (
         np.array_equal(a.boxes[:, :6], b.boxes[:, :6])

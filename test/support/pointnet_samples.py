@@ -30,12 +30,12 @@ SMALL = dict(
 )
 
 
-def small(name: str = "improved", **changes) -> PointNetConfig:
+def make_small_config(name: str = "improved", **changes) -> PointNetConfig:
     """Return the configuration of a network with few channels."""
     return make_pointnet_config(name, **{**SMALL, **changes})
 
 
-def lively(config: PointNetConfig, seed: int = 0) -> PointNet:
+def make_random_network(config: PointNetConfig, seed: int = 0) -> PointNet:
     """Return a network in eval mode whose norms were updated with random clusters, so that outputs differ between
     clusters."""
     torch.manual_seed(seed)
@@ -58,7 +58,9 @@ def lively(config: PointNetConfig, seed: int = 0) -> PointNet:
     return network.requires_grad_(False)
 
 
-def eager(params: PointNetDetectorParams = PointNetDetectorParams(), score: float = 0.0) -> PointNetDetectorParams:
+def accept_every_cluster(
+    params: PointNetDetectorParams = PointNetDetectorParams(), score: float = 0.0
+) -> PointNetDetectorParams:
     """Return parameters with which random weights detect something; a score of 0 accepts every cluster."""
     return with_values(
         params,
@@ -72,13 +74,15 @@ def make_classifier(network: PointNet, header: Header, engine: str = "auto") -> 
     return PointNetClassifier(TorchPointNet(fuse_norms(network), engine), header)
 
 
-def random_detector(params: PointNetDetectorParams | None = None, **changes) -> PointNetDetector:
+def make_random_detector(params: PointNetDetectorParams | None = None, **changes) -> PointNetDetector:
     """Return a PointNet detector with random weights."""
-    config = small(**changes)
-    return PointNetDetector(make_classifier(lively(config), Header(config)), params or eager())
+    config = make_small_config(**changes)
+    return PointNetDetector(
+        make_classifier(make_random_network(config), Header(config)), params or accept_every_cluster()
+    )
 
 
-def blobs(rng, sizes, spread=0.4):
+def make_blobs(rng, sizes, spread=0.4):
     """Return clusters with the given numbers of points, each around its own centre."""
     middles = rng.uniform(-30, 30, (len(sizes), 3)) * [1, 1, 0.03]
     number = np.repeat(np.arange(len(sizes)), sizes)

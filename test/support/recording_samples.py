@@ -6,15 +6,15 @@ import numpy as np
 import nuscenes_folder
 import pytest
 from bag_samples import scans
-from kitti_samples import raw_folder, tracking_folder
-from samples import CALIBRATION, object_folder, scene, write
+from kitti_samples import write_raw_folder, write_tracking_folder
+from samples import CALIBRATION, make_scene, write_file, write_object_folder
 
 from lidar_perception.data.frame import BOXES, CAMERA, POINT_LABELS, POSES
 from lidar_perception.data.semantickitti import format_calibration, format_pose, write_scan
 from lidar_perception.data.to_bag import write_bag
 
 
-def drive(i):
+def make_drive_pose(i):
     """Return the pose of scan i of a sequence."""
     yaw, pose = 0.1 * i, np.eye(4)
     pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
@@ -27,10 +27,10 @@ def semantic_folder(root):
     for sequence, count in (("00", 2), ("08", 1)):
         folder = root / "sequences" / sequence
         for i in range(count):
-            cloud = scene(i)
+            cloud = make_scene(i)
             write_scan(folder, i, cloud, np.arange(len(cloud)) % 260, np.arange(len(cloud)) % 7)
-        write(folder / "poses.txt", "".join(format_pose(drive(i), CALIBRATION) for i in range(count)))
-        write(folder / "calib.txt", format_calibration(CALIBRATION))
+        write_file(folder / "poses.txt", "".join(format_pose(make_drive_pose(i), CALIBRATION) for i in range(count)))
+        write_file(folder / "calib.txt", format_calibration(CALIBRATION))
     return root
 
 
@@ -39,7 +39,7 @@ def nuscenes_root(root):
 
 
 def reduced_folder(root):
-    tracking_folder(root)
+    write_tracking_folder(root)
     (root / "training/velodyne").rename(root / "training/velodyne_reduced")
     return root
 
@@ -54,10 +54,13 @@ def odometry_folder(root):
     for sequence, count in (("00", 2), ("11", 1)):
         folder = root / "dataset/sequences" / sequence
         for i in range(count):
-            write(folder / f"velodyne/{i:06}.bin", scene(i).tobytes())
-        write(folder / "calib.txt", format_calibration(CALIBRATION))
-        write(folder / "times.txt", "".join(f"{0.1036 * i:e}\n" for i in range(count)))
-        write(root / f"dataset/poses/{sequence}.txt", "".join(format_pose(drive(i), CALIBRATION) for i in range(count)))
+            write_file(folder / f"velodyne/{i:06}.bin", make_scene(i).tobytes())
+        write_file(folder / "calib.txt", format_calibration(CALIBRATION))
+        write_file(folder / "times.txt", "".join(f"{0.1036 * i:e}\n" for i in range(count)))
+        write_file(
+            root / f"dataset/poses/{sequence}.txt",
+            "".join(format_pose(make_drive_pose(i), CALIBRATION) for i in range(count)),
+        )
     return root
 
 
@@ -66,32 +69,32 @@ def kitti360_folder(root):
     name = "2013_05_28_drive_0000_sync"
     scans = root / f"data_3d_raw/{name}/velodyne_points"
     for i in (0, 1, 3):
-        write(scans / f"data/{i:010}.bin", scene(i).tobytes())
-    write(scans / "timestamps.txt", "".join(f"2013-05-28 08:46:02.{i}04700000\n" for i in range(4)))
+        write_file(scans / f"data/{i:010}.bin", make_scene(i).tobytes())
+    write_file(scans / "timestamps.txt", "".join(f"2013-05-28 08:46:02.{i}04700000\n" for i in range(4)))
     return root
 
 
 def openpcdet_folder(root):
     for i in range(3):
         (root / "points").mkdir(parents=True, exist_ok=True)
-        np.save(root / f"points/{i:06}.npy", scene(i))
-        write(root / f"labels/{i:06}.txt", "12.0 0.0 -0.98 3.9 1.6 1.5 0.1 Vehicle\n")
-    write(root / "ImageSets/train.txt", "000000\n000002\n")
+        np.save(root / f"points/{i:06}.npy", make_scene(i))
+        write_file(root / f"labels/{i:06}.txt", "12.0 0.0 -0.98 3.9 1.6 1.5 0.1 Vehicle\n")
+    write_file(root / "ImageSets/train.txt", "000000\n000002\n")
     return root
 
 
 def cloud_folder(root):
     for i in (1, 2, 10):  # in numeric order
-        write(root / f"scan{i}.bin", scene(i).astype(np.float32).tobytes())
+        write_file(root / f"scan{i}.bin", make_scene(i).astype(np.float32).tobytes())
     return root
 
 
 MADE = {  # name: (writer, inner paths that are the same recording, description, content)
-    "object": (object_folder, ("", "training"), "KITTI object data, 2 frames", {BOXES, CAMERA}),
-    "tracking": (tracking_folder, ("", "training"), "KITTI tracking data, 5 frames", {BOXES, CAMERA}),
+    "object": (write_object_folder, ("", "training"), "KITTI object data, 2 frames", {BOXES, CAMERA}),
+    "tracking": (write_tracking_folder, ("", "training"), "KITTI tracking data, 5 frames", {BOXES, CAMERA}),
     "reduced": (reduced_folder, ("", "training"), "KITTI tracking data, 5 frames", {BOXES, CAMERA}),
     "raw": (
-        raw_folder,
+        write_raw_folder,
         ("", "2011_09_26", "2011_09_26/2011_09_26_drive_0001_sync"),
         "KITTI raw drives, 3 frames",
         {BOXES, CAMERA},

@@ -21,7 +21,7 @@ ON_BASE[:3, :3] = ON_BASE[:3, :3] @ Rotation.from_euler("z", 90, degrees=True).a
 ON_BASE[0, 3] = 0.4
 
 
-def base_at(stamp):
+def compute_base_pose(stamp):
     """Return the pose of the base in odom, on a curve."""
     t = (stamp - START) / SECOND_NS
     pose = np.eye(4)
@@ -30,12 +30,12 @@ def base_at(stamp):
     return pose
 
 
-def stamps():
+def list_stamps():
     """Return the stamps of the clouds, which are between those of the odometry."""
     return [START + round((0.1 * i + 0.003) * SECOND_NS) for i in range(CLOUDS)]
 
 
-def transform(parent, child, stamp, pose):
+def make_transform(parent, child, stamp, pose):
     x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
     return make_bag_message(
         "geometry_msgs/msg/TransformStamped",
@@ -49,11 +49,11 @@ def transform(parent, child, stamp, pose):
     )
 
 
-def tf(*transforms):
+def make_tf_message(*transforms):
     return make_bag_message(TF_MESSAGE, transforms=list(transforms))
 
 
-def moving(topic, child="base_link", seconds=CLOUDS / 10):
+def make_odometry_rows(topic, child="base_link", seconds=CLOUDS / 10):
     """Yield odometry every 20 ms."""
     for i in range(-2, round(50 * seconds) + 1):
         stamp = START + i * SECOND_NS // 50
@@ -61,11 +61,13 @@ def moving(topic, child="base_link", seconds=CLOUDS / 10):
             topic,
             ODOMETRY_MESSAGE,
             stamp,
-            make_odometry(base_at(stamp), make_header(stamp, "odom", make_bag_message), child, make_bag_message),
+            make_odometry(
+                compute_base_pose(stamp), make_header(stamp, "odom", make_bag_message), child, make_bag_message
+            ),
         )
 
 
-def moving_tf(seconds=CLOUDS / 10):
+def make_tf_rows(seconds=CLOUDS / 10):
     """Yield map -> odom -> base_link every 20 ms; the map frame jumps."""
     for i in range(-2, round(50 * seconds) + 1):
         stamp = START + i * SECOND_NS // 50
@@ -74,28 +76,31 @@ def moving_tf(seconds=CLOUDS / 10):
             TF,
             TF_MESSAGE,
             stamp,
-            tf(transform("map", "odom", stamp, jump), transform("odom", "base_link", stamp, base_at(stamp))),
+            make_tf_message(
+                make_transform("map", "odom", stamp, jump),
+                make_transform("odom", "base_link", stamp, compute_base_pose(stamp)),
+            ),
         )
 
 
-def mount(parent="base_link", pose=ON_BASE):
+def make_mount_rows(parent="base_link", pose=ON_BASE):
     yield (
         TF_STATIC,
         TF_MESSAGE,
         START,
-        tf(transform(parent, "plate", 0, np.eye(4)), transform("plate", "/lidar", 0, pose)),
+        make_tf_message(make_transform(parent, "plate", 0, np.eye(4)), make_transform("plate", "/lidar", 0, pose)),
     )
 
 
-def point(stamp):
+def make_point_cloud(stamp):
     """Return a cloud of one point."""
     return make_cloud_message(np.ones((3, 4)), stamp, "lidar")
 
 
-def recorded(path, *parts, cloud=point):
+def write_robot_bag(path, *parts, cloud=make_point_cloud):
     """Write a bag of clouds in the frame lidar and the given messages; return the recording."""
     messages = [message for part in parts for message in part]
-    messages += [(POINTS, "sensor_msgs/msg/PointCloud2", stamp, cloud(stamp)) for stamp in stamps()]
+    messages += [(POINTS, "sensor_msgs/msg/PointCloud2", stamp, cloud(stamp)) for stamp in list_stamps()]
     with BagWriter(path) as bag:
         for topic, kind in dict.fromkeys((topic, kind) for topic, kind, *_ in messages):
             bag.add_topic(topic, kind)
@@ -104,11 +109,11 @@ def recorded(path, *parts, cloud=point):
     return open_recording(path)
 
 
-def check(recording, on_base=ON_BASE):
+def check_poses(recording, on_base=ON_BASE):
     """Assert that the poses are those of the base and the mount."""
     assert POSES in recording.contents
-    for frame, stamp in zip(recording, stamps(), strict=True):
-        np.testing.assert_allclose(frame.pose(), base_at(stamp) @ on_base, atol=1e-4)
+    for frame, stamp in zip(recording, list_stamps(), strict=True):
+        np.testing.assert_allclose(frame.pose(), compute_base_pose(stamp) @ on_base, atol=1e-4)
 
 
 def read_pose(pose):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from robot_bags import tf, transform
+from robot_bags import make_tf_message, make_transform
 from samples import WALKER
-from samples import scene as walker_scene
+from samples import make_scene as walker_scene
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.robot.poses import invert_pose, transform_points
@@ -18,12 +18,12 @@ PERIOD = 10**8
 WALKING = {"seed.source": "click", "clustering.dbscan.eps": (0.5, 0.5, 0.5)}
 
 
-def give(node, msg):
+def deliver_cloud(node, msg):
     """Deliver a cloud as the middleware does."""
     node.inputs.receptions[0].deliver(encode(msg), False)
 
 
-def message(xyz, stamp=START, intensity=None, frame_id="lidar", **columns):
+def make_robot_cloud(xyz, stamp=START, intensity=None, frame_id="lidar", **columns):
     kinds = [*((n, "<f4") for n in ("x", "y", "z", "intensity")), *((k, v.dtype.str) for k, v in columns.items())]
     points = np.zeros(len(xyz), kinds)
     points["x"], points["y"], points["z"] = np.asarray(xyz, np.float32).T
@@ -35,10 +35,10 @@ def message(xyz, stamp=START, intensity=None, frame_id="lidar", **columns):
 
 def transforms(*rows):
     """Return a tf2_msgs/TFMessage of rows (parent, child, pose (4, 4), stamp)."""
-    return tf(*(transform(parent, child, stamp, pose) for parent, child, pose, stamp in rows))
+    return make_tf_message(*(make_transform(parent, child, stamp, pose) for parent, child, pose, stamp in rows))
 
 
-def odometry(pose, stamp, child="base", frame="odom"):
+def make_base_odometry(pose, stamp, child="base", frame="odom"):
     t, q = pose[:3, 3].tolist(), Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
     found = make_bag_message(
         "nav_msgs/msg/Odometry", child_frame_id=child, header=make_header(stamp, frame, make_bag_message)
@@ -57,11 +57,11 @@ def mount_pose(x, y, height, yaw, pitch, roll):
     return pose
 
 
-def problems(node):
+def list_problems(node):
     return " ".join(p[2] for p in node.diagnostics.find_problems())
 
 
-def walker(base):
+def make_walker(base):
     """Return walker_scene() on the floor of the base, in the frame of a sensor at pose `base`, and
     the position of its person in the base."""
     on_floor = walker_scene()[:, :3].astype(np.float64) + [0, 0, 1.7]

@@ -16,7 +16,7 @@ CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerAr
 XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 
 
-def cloud(xyz, stamp=1, **changes):
+def make_ros_cloud(xyz, stamp=1, **changes):
     msg = make_cloud_message(xyz, stamp)
     for name, value in changes.items():
         setattr(msg, name, value)
@@ -24,33 +24,33 @@ def cloud(xyz, stamp=1, **changes):
 
 
 def make_cloud_without_x():
-    msg = cloud(np.ones((5, 3)))
+    msg = make_ros_cloud(np.ones((5, 3)))
     msg.fields[0].name = "a"
     return msg
 
 
 def make_cloud_with_integer_z():
-    msg = cloud(np.ones((5, 3)))
+    msg = make_ros_cloud(np.ones((5, 3)))
     msg.fields[2].datatype = 5
     return msg
 
 
-def big_endian(xyz, stamp):
+def to_big_endian(xyz, stamp):
     points = np.asarray(xyz, np.float32).view(XYZ).reshape(-1).astype(XYZ.newbyteorder(">"))
     return from_array(points, make_header(stamp, "lidar", make_bag_message), make_bag_message)
 
 
 BAD = {  # defect -> message, words of the diagnostic
-    "empty": (cloud(np.zeros((0, 3))), "no finite point"),
+    "empty": (make_ros_cloud(np.zeros((0, 3))), "no finite point"),
     "missing x": (make_cloud_without_x(), "no field 'x'"),
     "no fields at all": (make_bag_message(CLOUD), "no field 'x'"),
-    "all NaN": (cloud(np.full((9, 3), np.nan)), "no finite point"),
-    "cut": (cloud(np.ones((5, 3)), data=np.zeros(7, np.uint8)), "7 bytes"),
-    "all infinite": (cloud(np.full((9, 3), np.inf)), "no finite point"),
+    "all NaN": (make_ros_cloud(np.full((9, 3), np.nan)), "no finite point"),
+    "cut": (make_ros_cloud(np.ones((5, 3)), data=np.zeros(7, np.uint8)), "7 bytes"),
+    "all infinite": (make_ros_cloud(np.full((9, 3), np.inf)), "no finite point"),
     "integer z": (make_cloud_with_integer_z(), "'z'"),
-    "more points than bytes": (cloud(np.ones((5, 3)), width=2**31), "bytes"),
-    "point_step 0": (cloud(np.ones((5, 3)), point_step=0), "point_step"),
-    "one point": (cloud([[5, 0, -1]]), "no ground"),
+    "more points than bytes": (make_ros_cloud(np.ones((5, 3)), width=2**31), "bytes"),
+    "point_step 0": (make_ros_cloud(np.ones((5, 3)), point_step=0), "point_step"),
+    "one point": (make_ros_cloud([[5, 0, -1]]), "no ground"),
 }
 
 

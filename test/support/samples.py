@@ -83,11 +83,11 @@ DontCare -1 -1 -10 503.89 169.71 590.61 190.13 -1 -1 -1 -1000 -1000 -1000 -10
 """
 
 
-def header(make, ns: int = STAMP, frame_id: str = "velodyne"):
+def make_any_header(make, ns: int = STAMP, frame_id: str = "velodyne"):
     return make_header(ns, frame_id, make)
 
 
-def scene(seed: int = 0) -> np.ndarray:
+def make_scene(seed: int = 0) -> np.ndarray:
     """Return flat ground 1.7 m below and a person inside the box WALKER, (N, 4) float32."""
     rng = np.random.default_rng(seed)
     flat = rng.uniform(-20, 20, (3000, 3)) * [1, 1, 0.001] - [0, 0, 1.7]
@@ -96,42 +96,43 @@ def scene(seed: int = 0) -> np.ndarray:
     return np.column_stack([xyz, rng.uniform(0, 1, len(xyz))]).astype(np.float32)
 
 
-def walker_truth() -> GroundTruth:
+def make_walker_truth() -> GroundTruth:
     return GroundTruth.of([WALKER], [PEDESTRIAN])
 
 
-def walker_label() -> str:
-    return format_label(to_labels(walker_truth(), LIDAR_TO_CAMERA)[0])
+def make_walker_label() -> str:
+    return format_label(to_labels(make_walker_truth(), LIDAR_TO_CAMERA)[0])
 
 
-def numbers(matrix: np.ndarray) -> str:
+def format_numbers(matrix: np.ndarray) -> str:
     return " ".join(f"{v!r}" for v in np.asarray(matrix).ravel().tolist())
 
 
-def calibration_text(rectify: str = "R0_rect:", velodyne: str = "Tr_velo_to_cam:") -> str:
-    return f"P2: {numbers(INTRINSICS)}\n{rectify} {numbers(RECTIFY)}\n{velodyne} {numbers(VELODYNE)}\n"
+def make_calibration_text(rectify: str = "R0_rect:", velodyne: str = "Tr_velo_to_cam:") -> str:
+    rows = {"P2:": INTRINSICS, rectify: RECTIFY, velodyne: VELODYNE}
+    return "".join(f"{name} {format_numbers(values)}\n" for name, values in rows.items())
 
 
-def write(path: Path, content: str | bytes | np.ndarray) -> Path:
+def write_file(path: Path, content: str | bytes | np.ndarray) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(content.encode() if isinstance(content, str) else bytes(content))
     return path
 
 
-def png_header(width: int, height: int) -> bytes:
+def make_png_header(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", width, height)
 
 
-def object_folder(root: Path, labels: str = LABELS, count: int = 2) -> Path:
+def write_object_folder(root: Path, labels: str = LABELS, count: int = 2) -> Path:
     """Write a KITTI object folder training/{velodyne,calib,label_2} with frames 000000..."""
     for i in range(count):
-        write(root / f"training/velodyne/{i:06}.bin", scene(i).tobytes())
-        write(root / f"training/calib/{i:06}.txt", calibration_text())
-        write(root / f"training/label_2/{i:06}.txt", labels)
+        write_file(root / f"training/velodyne/{i:06}.bin", make_scene(i).tobytes())
+        write_file(root / f"training/calib/{i:06}.txt", make_calibration_text())
+        write_file(root / f"training/label_2/{i:06}.txt", labels)
     return root
 
 
-def upright(rng, x: float, y: float, height: float, width: float) -> np.ndarray:
+def make_upright(rng, x: float, y: float, height: float, width: float) -> np.ndarray:
     """Return the visible side of an object (N, 3), with fewer points at larger distances. With negative width it
     is a person, narrow at the head and the feet."""
     away = np.hypot(x, y)
@@ -145,7 +146,7 @@ def upright(rng, x: float, y: float, height: float, width: float) -> np.ndarray:
     return xyz + np.outer(rng.uniform(-0.2, 0.2, len(xyz)), depth)
 
 
-def crowd(seed: int, people: int = 4) -> tuple[np.ndarray, GroundTruth]:
+def make_crowd(seed: int, people: int = 4) -> tuple[np.ndarray, GroundTruth]:
     """Return a cloud (N, 4) float32 and labels: people, posts, boxes and a labelled car without points on flat
     ground 1.7 m below, 6 to 40 m away, none of them across 15 or 30 m."""
     rng = np.random.default_rng(seed)
@@ -158,12 +159,12 @@ def crowd(seed: int, people: int = 4) -> tuple[np.ndarray, GroundTruth]:
 
     for azimuth in rng.permutation(np.linspace(-0.2, 0.2, 5))[:people]:
         (x, y), height = somewhere(azimuth), rng.uniform(1.6, 1.9)
-        parts.append(upright(rng, x, y, height, -1))
+        parts.append(make_upright(rng, x, y, height, -1))
         boxes.append([x, y, height / 2 - 1.7, 0.6, 0.6, height, rng.uniform(-3, 3)])
         ids.append(PEDESTRIAN)
     for width in (0.15, 0.4, 0.4, 0.8, 0.8, 1.0):
         parts.append(
-            upright(rng, *somewhere(rng.choice([-1, 1]) * rng.uniform(0.3, 0.5)), rng.uniform(1.5, 2.0), width)
+            make_upright(rng, *somewhere(rng.choice([-1, 1]) * rng.uniform(0.3, 0.5)), rng.uniform(1.5, 2.0), width)
         )
     boxes.append([15, 8, -0.95, 4.0, 1.6, 1.5, 0.1])
     ids.append(CLASSES.index("Car"))
@@ -171,18 +172,18 @@ def crowd(seed: int, people: int = 4) -> tuple[np.ndarray, GroundTruth]:
     return np.column_stack([xyz, rng.uniform(0, 1, len(xyz))]).astype(np.float32), GroundTruth.of(boxes, ids)
 
 
-def lowered_crowd(seed: int, by: float) -> Frame:
+def make_lowered_crowd(seed: int, by: float) -> Frame:
     """Return the frame of a crowd seen by a sensor that is `by` metres lower, at 0.1 s times the seed."""
-    cloud, truth = crowd(seed)
+    cloud, truth = make_crowd(seed)
     up = np.array([0, 0, by], np.float32)
     scan = PointCloud.of(cloud[:, :3] + up, cloud[:, 3].copy(), 10**9 + seed * 10**8, "velodyne")
     return Frame.of(str(seed), scan, GroundTruth.of(truth.boxes + np.pad(up, (0, 4)), truth.class_ids))
 
 
-def crowd_folder(root: Path, count: int = 6) -> Path:
+def write_crowd_folder(root: Path, count: int = 6) -> Path:
     """Write a KITTI object folder with crowds of people; the last frame has none."""
     for i in range(count):
-        cloud, truth = crowd(i, people=4 if i < count - 1 else 0)
+        cloud, truth = make_crowd(i, people=4 if i < count - 1 else 0)
         write_object(root, i, cloud, truth, CALIBRATION)
     return root
 

@@ -20,7 +20,7 @@ def best_assignment(rows, columns, gain):
     return sorted((i, j) for i, j in pairs if gain(i, j) > 1e-15)
 
 
-def counted(frames):
+def drop_ignored_labels(frames):
     """Remove ignored labels: return frames of labels [id], tracks [id], alike {(i, j): s}."""
     result = []
     for labels, tracks, alike, _ in frames:
@@ -42,11 +42,11 @@ def counted(frames):
     return result
 
 
-def hota(sequences):
+def compute_hota(sequences):
     """Return HOTA, DetA and AssA."""
     alphas = [0.05 * k for k in range(1, 20)]
     tp, labels, boxes, associated = ([0.0] * len(alphas) for _ in range(4))
-    for frames in map(counted, sequences):
+    for frames in map(drop_ignored_labels, sequences):
         length, found, together = {}, {}, {}
         for true, tracks, alike in frames:
             for i in true:
@@ -80,10 +80,10 @@ def hota(sequences):
     return (float(np.mean([(d * a) ** 0.5 for d, a in zip(det, ass)])), float(np.mean(det)), float(np.mean(ass)))
 
 
-def clear(sequences):
+def compute_clear(sequences):
     """Return tp, fn, fp, switches and fragments."""
     tp = fn = fp = switches = fragments = 0
-    for frames in map(counted, sequences):
+    for frames in map(drop_ignored_labels, sequences):
         last, before, ever = {}, {}, set()
         for true, tracks, alike in frames:
             if not true or not tracks:
@@ -106,7 +106,7 @@ def clear(sequences):
     return tp, fn, fp, switches, fragments
 
 
-def over_recall(sequences):
+def compute_over_recall(sequences):
     """Return sAMOTA, AMOTA and AMOTP."""
     mean = []
     for frames in sequences:

@@ -7,7 +7,7 @@ import importlib.util
 import numpy as np
 import pytest
 from marker_messages import make_detection_markers
-from samples import each_make, header, scene, walker_truth
+from samples import each_make, make_any_header, make_scene, make_walker_truth
 
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
@@ -25,7 +25,7 @@ from msg_utils.point_cloud2 import to_array
 NAMES = ("Car", "Pedestrian", "Cyclist")
 
 
-def some(rng, count):
+def draw_objects(rng, count):
     boxes = np.column_stack(
         [
             rng.uniform(-30, 30, (count, 2)),
@@ -37,24 +37,26 @@ def some(rng, count):
     return Detections.of(boxes, [CLASSES.index(n) for n in rng.choice(NAMES, count)], rng.uniform(0, 1, count))
 
 
-def pairs_of(objects):
+def get_pairs(objects):
     return [(label, box) for label, box in zip(objects.labels, objects.boxes)]
 
 
 @each_make
 def test_every_type_of_detections_gives_the_same_message(make):
-    found = some(np.random.default_rng(0), 7)
+    found = draw_objects(np.random.default_rng(0), 7)
     expected = to_objects(found)
     truth = GroundTruth.of(found.boxes, found.class_ids)
     kinds = [
-        make_detection_markers(found, header(make), make),
-        make_truth_markers(truth, header(make), make),
+        make_detection_markers(found, make_any_header(make), make),
+        make_truth_markers(truth, make_any_header(make), make),
         truth,
         expected,
-        pairs_of(expected),
+        get_pairs(expected),
     ]
     if make is not make_bag_message and importlib.util.find_spec("vision_msgs"):
-        kinds.append(to_detection_array(found.boxes, expected.labels, found.scores, header=header(make), make=make))
+        kinds.append(
+            to_detection_array(found.boxes, expected.labels, found.scores, header=make_any_header(make), make=make)
+        )
     for kind in kinds:
         objects = to_objects(kind)
         assert objects.labels == expected.labels
@@ -68,7 +70,7 @@ def test_order_does_not_matter_and_missing_detection_is_named(limit):
     """Objects that are missing in one direction are extra in the other."""
     rng = np.random.default_rng(1)
     for _ in range(30):
-        expected = some(rng, int(rng.integers(1, 20)))
+        expected = draw_objects(rng, int(rng.integers(1, 20)))
         order = rng.permutation(len(expected))
         found = expected[order]
         assert sorted(assert_detections(found, expected, **limit)) == [(i, int(j)) for i, j in enumerate(order)]
@@ -115,30 +117,30 @@ def test_invalid_detections_are_rejected(found, words):
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_arrays_survive_writing_to_a_bag(make_bag, storage):
-    truths = [walker_truth(), None, [("Pedestrian", walker_truth().boxes[0])]]
-    path = make_bag([scene(i) for i in range(3)], truths, storage=storage, points="/front", hz=5.0)
+    truths = [make_walker_truth(), None, [("Pedestrian", make_walker_truth().boxes[0])]]
+    path = make_bag([make_scene(i) for i in range(3)], truths, storage=storage, points="/front", hz=5.0)
     assert [p.suffix for p in path.iterdir() if p.name != "metadata.yaml"] == [
         {"mcap": ".mcap", "sqlite3": ".db3"}[storage]
     ]
     with Bag(path) as bag:
         clouds = [to_point_cloud(m, 1.0)[0] for _, _, m in bag.messages({"/front"})]
-    assert [np.array_equal(c.xyz, scene(i)[:, :3]) for i, c in enumerate(clouds)] == [True] * 3
-    assert np.array_equal(clouds[0].intensity, scene(0)[:, 3])
+    assert [np.array_equal(c.xyz, make_scene(i)[:, :3]) for i, c in enumerate(clouds)] == [True] * 3
+    assert np.array_equal(clouds[0].intensity, make_scene(0)[:, 3])
     assert np.diff([c.stamp_ns for c in clouds]).tolist() == [2 * 10**8] * 2
-    frames = open_recording(make_bag([scene(0)[:, :3]] * 3, truths, storage=storage))
+    frames = open_recording(make_bag([make_scene(0)[:, :3]] * 3, truths, storage=storage))
     assert [frame.truth() is not None for frame in frames] == [True, False, True]
-    np.testing.assert_allclose(frames.frames[2].truth().boxes, walker_truth().boxes)
+    np.testing.assert_allclose(frames.frames[2].truth().boxes, make_walker_truth().boxes)
 
 
 @pytest.mark.parametrize(
     "clouds, labels, options, words",
     [
         ([np.zeros((5, 2))], None, {}, r"cloud 0 has shape \(5, 2\)"),
-        ([scene()], [], {}, "1 clouds, but labels for 0"),
-        ([scene()], [[("Dragon", [0] * 7)]], {}, "unknown class 'Dragon'; choose from Car"),
-        ([scene()], [[("Car", [0] * 3)]], {}, "complete boxes"),
-        ([scene()], None, {"storage": "tape"}, "unknown storage 'tape'; choose from mcap, sqlite3"),
-        (make_frames([scene()]), [None], {"hz": 5.0}, "leave out labels and hz"),
+        ([make_scene()], [], {}, "1 clouds, but labels for 0"),
+        ([make_scene()], [[("Dragon", [0] * 7)]], {}, "unknown class 'Dragon'; choose from Car"),
+        ([make_scene()], [[("Car", [0] * 3)]], {}, "complete boxes"),
+        ([make_scene()], None, {"storage": "tape"}, "unknown storage 'tape'; choose from mcap, sqlite3"),
+        (make_frames([make_scene()]), [None], {"hz": 5.0}, "leave out labels and hz"),
     ],
 )
 def test_error_names_the_bag_that_cannot_be_written(make_bag, clouds, labels, options, words):
@@ -148,9 +150,9 @@ def test_error_names_the_bag_that_cannot_be_written(make_bag, clouds, labels, op
 
 def test_cloud_message_has_the_given_columns():
     ring = np.arange(3400, dtype=np.uint16) % 64
-    points = to_array(make_cloud_message(scene(), 7, ring=ring))
+    points = to_array(make_cloud_message(make_scene(), 7, ring=ring))
     assert np.array_equal(points["ring"], ring) and points.dtype["ring"] == np.uint16
-    assert np.array_equal(points["intensity"], scene()[:, 3])
+    assert np.array_equal(points["intensity"], make_scene()[:, 3])
     with pytest.raises(InputError, match=r"expected \(N, 3\)"):
         make_cloud_message(np.zeros(3))
 

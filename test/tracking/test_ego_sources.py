@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tracking_samples import pose
+from tracking_samples import make_flat_pose
 
 from lidar_perception.data.frame import POSES, Frame, Recording
 from lidar_perception.simulation.drive import simulate_drive
@@ -108,7 +108,7 @@ def test_odometry_registers_small_scans(drive):
     near = xyz[np.linalg.norm(xyz[:, :2], axis=1) < 12]
     odometry = Odometry()
     for i in range(5):
-        at = pose(0.1 * i, 0.02 * i, 0.01 * i)
+        at = make_flat_pose(0.1 * i, 0.02 * i, 0.01 * i)
         seen = near @ at[:3, :3] - at[:3, 3] @ at[:3, :3]
         found = odometry(seen.astype(np.float32))
     np.testing.assert_allclose(found, at, atol=0.05)

@@ -21,14 +21,14 @@ STATE = st.tuples(NUMBERS, NUMBERS, NUMBERS, NUMBERS, st.floats(-3, 3), st.float
 NONE = np.zeros(1)
 
 
-def spread(seed=0, count=1):
+def draw_covariances(seed=0, count=1):
     parts = np.random.default_rng(seed).normal(size=(count, 6, 6))
     return parts @ parts.transpose(0, 2, 1) + 0.1 * np.eye(6)
 
 
 @given(STATE, st.floats(0, 2), st.floats(0, 2))
 def test_two_predictions_equal_one_long_prediction(state, first, second):
-    means, p = np.array([state]), spread()
+    means, p = np.array([state]), draw_covariances()
     at_once = predict(means, p, first + second, NONE, NONE, NONE)
     again = predict(*predict(means, p, first, NONE, NONE, NONE), second, NONE, NONE, NONE)
     np.testing.assert_allclose(again[0][:, [0, 1, 2, 3, 5]], at_once[0][:, [0, 1, 2, 3, 5]], atol=1e-6)
@@ -37,7 +37,7 @@ def test_two_predictions_equal_one_long_prediction(state, first, second):
 
 @given(STATE, st.floats(0.01, 0.5))
 def test_covariance_prediction_matches_numeric_jacobian(state, seconds):
-    means, p = np.array([state]), spread(3)
+    means, p = np.array([state]), draw_covariances(3)
     _, grown = predict(means, p, seconds, NONE, NONE, NONE)
     step, slope = 1e-5, np.zeros((6, 6))
     for k in range(6):
@@ -50,12 +50,12 @@ def test_covariance_prediction_matches_numeric_jacobian(state, seconds):
 
 def test_constant_turn_rate_gives_a_circle():
     circle = np.array([[0.0, 0.0, 2.0, 0.0, 0.0, np.pi / 2]])
-    means, _ = predict(circle, spread(), 4.0, NONE, NONE, NONE)  # a full circle
+    means, _ = predict(circle, draw_covariances(), 4.0, NONE, NONE, NONE)  # a full circle
     np.testing.assert_allclose(means, circle, atol=1e-9)
 
 
 def test_update_shrinks_covariance_and_moves_to_measurement():
-    means, p = np.zeros((4, 6)), spread(1, 4)
+    means, p = np.zeros((4, 6)), draw_covariances(1, 4)
     measured = np.full((4, 3), 0.3)
     after, narrower = update(means, p, measured, np.full((4, 3), 0.1))
     assert (np.linalg.eigvalsh(p - narrower) > -1e-9).all()
@@ -69,7 +69,7 @@ def test_update_shrinks_covariance_and_moves_to_measurement():
 def test_opposite_headings_give_equal_updates(heading, off):
     means = np.array([[0, 0, 0, 0, heading, 0.0]])
     ends = [
-        update(means, spread(2), np.array([[0.1, 0.2, heading + off + k * np.pi]]), np.full((1, 3), 0.2))[0]
+        update(means, draw_covariances(2), np.array([[0.1, 0.2, heading + off + k * np.pi]]), np.full((1, 3), 0.2))[0]
         for k in (0, 1)
     ]
     np.testing.assert_allclose(ends[0][0, :4], ends[1][0, :4], atol=1e-7)
@@ -92,7 +92,7 @@ def test_lateral_speed_decays_and_reversed_heading_is_flipped():
 def test_covariances_rotate_with_the_axes():
     angle = 0.7
     cos, sin = np.cos(angle), np.sin(angle)
-    p = spread(5)
+    p = draw_covariances(5)
     rotated = rotate_covariances(p, cos, sin)
     np.testing.assert_allclose(rotate_covariances(rotated, cos, -sin), p, atol=1e-12)
     r = np.array([[cos, -sin], [sin, cos]])

@@ -14,7 +14,7 @@ from lidar_perception.types import CLASSES, Detections, GroundTruth
 CAR = CLASSES.index("Car")
 
 
-def one(x):
+def make_detection(x):
     return Detections.of([[x, 0, -1, 4, 1.8, 1.5, 0]], CAR, 0.9)
 
 
@@ -22,7 +22,10 @@ def test_track_starts_after_three_hits_and_ends_after_two_misses():
     tracker, none = PlainAb3dmot(), Detections.none()
     for _ in range(4):
         tracker(none)
-    shown = [len(tracker(found)[0]) for found in (one(10), one(11), one(12), none, none, one(15))]
+    shown = [
+        len(tracker(found)[0])
+        for found in (make_detection(10), make_detection(11), make_detection(12), none, none, make_detection(15))
+    ]
     assert shown == [0, 0, 1, 1, 0, 0]
 
 
@@ -31,7 +34,7 @@ def test_plain_tracker_follows_car_and_compensates_poses():
     for i in range(20):
         pose = np.eye(4)
         pose[0, 3] = 0.9 * i
-        ids, found = tracker(one(30 - 0.9 * i), pose)
+        ids, found = tracker(make_detection(30 - 0.9 * i), pose)
         assert ids.tolist() == [1] and found.boxes[0, 0] == pytest.approx(30 - 0.9 * i, abs=0.05)
     assert np.abs(tracker.tracks[CAR][0].state[7:]).max() < 0.05
 
@@ -39,8 +42,8 @@ def test_plain_tracker_follows_car_and_compensates_poses():
 def test_both_trackers_are_scored_on_the_same_frames():
     frames = [
         TrackedFrame(
-            one(10 + i),
-            GroundTruth.of(one(10 + i).boxes, [CAR], [{"track_id": 5, "occluded": 0, "truncated": 0.0}]),
+            make_detection(10 + i),
+            GroundTruth.of(make_detection(10 + i).boxes, [CAR], [{"track_id": 5, "occluded": 0, "truncated": 0.0}]),
             10**18 + i * 10**8,
         )
         for i in range(12)
@@ -60,9 +63,11 @@ def test_only_recordings_with_track_ids_are_tracked(monkeypatch):
     from lidar_perception.data.frame import Frame, Recording
     from lidar_perception.types import PointCloud
 
-    scans = [PointCloud(one(10 + i).boxes[:, :3], None, 10**18 + i * 10**8) for i in range(6)]
+    scans = [PointCloud(make_detection(10 + i).boxes[:, :3], None, 10**18 + i * 10**8) for i in range(6)]
     monkeypatch.setattr(
-        tracking, "open_detector", lambda *_, **__: lambda scan: SimpleNamespace(detections=one(scan.xyz[0, 0]))
+        tracking,
+        "open_detector",
+        lambda *_, **__: lambda scan: SimpleNamespace(detections=make_detection(scan.xyz[0, 0])),
     )
 
     def recording(sequence, extra):
@@ -70,7 +75,13 @@ def test_only_recordings_with_track_ids_are_tracked(monkeypatch):
             Path("drive"),
             "made up",
             [
-                Frame.of(str(i), scan, GroundTruth.of(one(10 + i).boxes, [CAR], [extra]), sequence=sequence, index=i)
+                Frame.of(
+                    str(i),
+                    scan,
+                    GroundTruth.of(make_detection(10 + i).boxes, [CAR], [extra]),
+                    sequence=sequence,
+                    index=i,
+                )
                 for i, scan in enumerate(scans)
             ],
         )

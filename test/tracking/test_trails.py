@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tracking_samples import START, TENTH, car, cars, crowd, pose
+from tracking_samples import START, TENTH, make_car, make_crowd_detections, make_detections, make_flat_pose
 
 from lidar_perception.robot.poses import transform_boxes
 from lidar_perception.tracking.tracker import Tracker
@@ -18,8 +18,8 @@ from msg_utils.stamps import make_header
 @pytest.mark.parametrize("seconds", [0.0, 0.55, 2.0])
 def test_trails_are_the_past_positions_of_tracks(seconds):
     tracker, trails, seen = Tracker(), Trails(), {}
-    for i, found in enumerate(crowd(2, 40)):
-        at, stamp = pose(0.9 * i, 0.1 * i, 0.03 * i), START + i * TENTH
+    for i, found in enumerate(make_crowd_detections(2, 40)):
+        at, stamp = make_flat_pose(0.9 * i, 0.1 * i, 0.03 * i), START + i * TENTH
         local = Detections.of(transform_boxes(found.boxes, np.linalg.inv(at)), found.class_ids, found.scores)
         tracks = tracker(local, stamp, at)
         lines = trails(tracks, tracker.pose, stamp, seconds)
@@ -36,7 +36,7 @@ def test_trails_last_equally_long_at_any_rate(rate, seconds):
     tracker, trails = Tracker(), Trails()
     for i in range(round(1.5 * seconds * rate)):
         stamp = START + i * 10**9 // rate + 1000 * (i % 3)  # up to 2 us late
-        tracks = tracker(cars(car(2 * i / rate)), stamp, pose(0))
+        tracks = tracker(make_detections(make_car(2 * i / rate)), stamp, make_flat_pose(0))
         (line,) = trails(tracks, tracker.pose, stamp, seconds)
         assert len(line) <= TRAIL_POINTS and line[-1, 0] == tracks.detections.boxes[0, 0]
         assert (np.diff(line[:, 0]) > 0).all()
@@ -47,7 +47,7 @@ def test_trails_last_equally_long_at_any_rate(rate, seconds):
 @pytest.fixture(scope="module")
 def tracks():
     tracker = Tracker()
-    return [tracker(found, START + i * TENTH) for i, found in enumerate(crowd())][-1]
+    return [tracker(found, START + i * TENTH) for i, found in enumerate(make_crowd_detections())][-1]
 
 
 def test_pose_covariances_include_position_and_heading(tracks):

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from pointnet_samples import SMALL, blobs, make_classifier
+from pointnet_samples import SMALL, make_blobs, make_classifier
 from samples import CALIBRATION
 
 from lidar_perception.data.frame import Frame
@@ -136,7 +136,7 @@ def test_background_in_unlabelled_regions_is_unknown(rng):
 
 def test_cluster_and_point_scores_agree_with_hand_count(rng):
     scores = ClusterScores(CONFIG.classes)
-    clusters = blobs(rng, [20, 20, 12, 12, 9])
+    clusters = make_blobs(rng, [20, 20, 12, 12, 9])
     found = np.eye(4, dtype=np.float32)[[0, 3, 1, 2, 0]]
     labels = np.array([0, 0, 1, 3, 0])  # correct, missed, correct, wrong; too small to count
     numbers = np.array([1, 1, 2, 3, 0, 0])

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cli_samples import error_line, exit_of
-from detection_samples import frame, random_detector, same
+from cli_samples import read_error_line, run_main
+from detection_samples import are_equal_detections, make_random_detector, make_scan
 from fuzz.mutation import mutate_text
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -128,7 +128,7 @@ def test_objects_count_once_and_vans_are_ignored(camera: Camera | None):
         [0.3, 0.8, 0.9, 0.2, 0.5, 0.7, 0.9],
     )
     truth = GroundTruth.of(np.array([car, behind, person, van]), [CAR, CAR, PEDESTRIAN, CLASSES.index("Van")])
-    scan = frame()
+    scan = make_scan()
     look = Proposals(found, {"network": np.arange(7.0)}, scan.xyz, scan.xyz[:0], None, {}, {})
     own = collect_samples(Frame.of("street", scan, truth, camera), look, 7)
     expected = {1.0: True, 2.0: True, 4.0: True, 5.0: False}
@@ -216,11 +216,11 @@ def test_missing_class_and_foreign_sensor_are_reported(others):
 def test_detector_uses_curves_of_its_file_at_any_range(others):
     path, models = others
     loaded, package = load_fused_detector(path, "cpu"), load_fused_detector("", "cpu")
-    mine = FusedDetector(random_detector("v4").proposer, loaded.classifier, loaded.params, models)
+    mine = FusedDetector(make_random_detector("v4").proposer, loaded.classifier, loaded.params, models)
     theirs = FusedDetector(mine.proposer, package.classifier, package.params)
-    scan = frame()
+    scan = make_scan()
     odds = [detector.with_min_score(0.0)(scan).detections for detector in (mine, theirs)]
-    assert len(odds[0]) and not same(*odds)
+    assert len(odds[0]) and not are_equal_detections(*odds)
     around = loaded.with_range("around")
     assert around.models is loaded.models and around.warning is None
     half = with_values(loaded.params, {"fused.amp": "bf16", "fused.warm_up": False})
@@ -267,7 +267,7 @@ def test_train_fused_writes_usable_file(tmp_path, monkeypatch, capsys):
         "--out",
         out,
     ]
-    assert exit_of(monkeypatch, *command) == 0
+    assert run_main(monkeypatch, *command) == 0
     printed = capsys.readouterr()
     assert "2 street,campus,indoor scans of vlp-16 at 1 m, all around" in printed.err
     assert "too few samples to fit curves" in " ".join(printed.out.split())
@@ -276,7 +276,7 @@ def test_train_fused_writes_usable_file(tmp_path, monkeypatch, capsys):
     assert fusion.models_without_intensity == find_fusion().models_without_intensity != fusion.models
     assert fusion.fitted_to["sensor"] == "vlp-16" and fusion.fitted_to["range"] == "around"
     before = out.read_bytes()
-    assert exit_of(monkeypatch, *command) == 2 and "already exists" in error_line(capsys)
-    assert exit_of(monkeypatch, "train", "fused", "--out", tmp_path / "fused") == 2
-    assert "must end with .json" in error_line(capsys)
+    assert run_main(monkeypatch, *command) == 2 and "already exists" in read_error_line(capsys)
+    assert run_main(monkeypatch, "train", "fused", "--out", tmp_path / "fused") == 2
+    assert "must end with .json" in read_error_line(capsys)
     assert out.read_bytes() == before

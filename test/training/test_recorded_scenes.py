@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from detection_samples import tiny, two_objects
+from detection_samples import make_tiny_config, make_two_objects
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import WALKER, object_folder, walker_label, walker_truth, write
+from samples import WALKER, make_walker_label, make_walker_truth, write_file, write_object_folder
 from training_toy import STILL, broken_folder, prepare_all
 
 from lidar_perception.data.frame import Frame
@@ -45,14 +45,14 @@ def test_broken_scenes_are_skipped_reported_and_counted(tmp_path, capsys):
 
 
 def test_frame_without_labels_is_rejected(tmp_path):
-    root = object_folder(tmp_path, count=2)
+    root = write_object_folder(tmp_path, count=2)
     (root / "training/label_2/000001.txt").unlink()
     with pytest.raises(InputError, match=r"000001\.bin has no labels"):
         RecordedScenes(root, ("000001",)).load_scene(0)
 
 
 def test_kitti_scenes_are_cropped_to_the_image(tmp_path):
-    root = object_folder(tmp_path, walker_label() + "\n", 1)
+    root = write_object_folder(tmp_path, make_walker_label() + "\n", 1)
     ahead, whole = (RecordedScenes(root, ("000000",), view).load_scene(0) for view in (True, False))
     assert 0 < len(ahead.points) < len(whole.points)
     assert (ahead.points[:, 0] > 0).all() and (whole.points[:, 0] < 0).any()
@@ -61,7 +61,7 @@ def test_kitti_scenes_are_cropped_to_the_image(tmp_path):
 
 
 def test_bag_of_folder_has_same_scenes(tmp_path):
-    folder = object_folder(tmp_path / "kitti", walker_label() + "\n", 2)
+    folder = write_object_folder(tmp_path / "kitti", make_walker_label() + "\n", 2)
     write_bag(tmp_path / "bag", open_recording(folder))
     from_bag = open_labelled_frames(tmp_path / "bag").to_scenes()
     from_bag.load_scene(0)  # opens files, which cannot be pickled
@@ -74,10 +74,10 @@ def test_bag_of_folder_has_same_scenes(tmp_path):
 
 
 def test_scenes_without_camera_are_labelled_all_around(tmp_path):
-    frames = [Frame.of("0", PointCloud(two_objects()[:, :3].copy()), GroundTruth.of([WALKER], [PEDESTRIAN]))]
+    frames = [Frame.of("0", PointCloud(make_two_objects()[:, :3].copy()), GroundTruth.of([WALKER], [PEDESTRIAN]))]
     write_bag(tmp_path / "bag", frames)
     scene = open_labelled_frames(tmp_path / "bag").to_scenes().load_scene(0)
-    assert scene.all_around and np.array_equal(scene.points[:, :3], two_objects()[:, :3])
+    assert scene.all_around and np.array_equal(scene.points[:, :3], make_two_objects()[:, :3])
     assert not scene.points[:, 3].any()  # no intensity
     write_bag(tmp_path / "bare", [Frame.of("0", frames[0].load())])
     with pytest.raises(InputError, match="has no labelled boxes, which train needs"):
@@ -85,13 +85,13 @@ def test_scenes_without_camera_are_labelled_all_around(tmp_path):
 
 
 def test_split_file_selects_frames(tmp_path):
-    root = object_folder(tmp_path, count=4)
-    split = write(tmp_path / "train.txt", "000003\n000001\n")
+    root = write_object_folder(tmp_path, count=4)
+    split = write_file(tmp_path / "train.txt", "000003\n000001\n")
     assert open_labelled_frames(root, split).to_scenes().names == ("000003", "000001")
     assert len(open_labelled_frames(root).frames) == 4
     for text, reason in (("000009", "000009"), ("", "is empty")):
         with pytest.raises(InputError, match=reason):
-            open_labelled_frames(root, write(split, text))
+            open_labelled_frames(root, write_file(split, text))
     with pytest.raises(InputError, match="cannot read the split"):
         open_labelled_frames(root, tmp_path / "missing.txt")
 
@@ -119,8 +119,8 @@ def test_labelled_end_of_a_drive_is_held_out(tmp_path):
     frames = [
         Frame.of(
             str(i),
-            replace(PointCloud(two_objects()[:, :3].copy()), stamp_ns=i * 10**8),
-            walker_truth() if i < 8 else None,
+            replace(PointCloud(make_two_objects()[:, :3].copy()), stamp_ns=i * 10**8),
+            make_walker_truth() if i < 8 else None,
         )
         for i in range(10)
     ]
@@ -131,11 +131,11 @@ def test_labelled_end_of_a_drive_is_held_out(tmp_path):
 
 
 def test_cache_key_changes_with_files_and_height(tmp_path, monkeypatch):
-    root = object_folder(tmp_path / "kitti", walker_label() + "\n", 2)
+    root = write_object_folder(tmp_path / "kitti", make_walker_label() + "\n", 2)
     keys = [open_labelled_frames(root).to_scenes().cache_key(i) for i in range(2)]
     monkeypatch.chdir(tmp_path)
     assert open_labelled_frames(Path("kitti/training")).to_scenes().cache_key(0) == keys[0] != keys[1]
-    write(root / "training/label_2/000000.txt", "")
+    write_file(root / "training/label_2/000000.txt", "")
     now = open_labelled_frames(root).to_scenes()
     assert now.cache_key(0) != keys[0] and now.cache_key(1) == keys[1]
     assert open_labelled_frames(root, height=0.6).to_scenes().cache_key(1) != keys[1]
@@ -160,7 +160,7 @@ def low_bag(path: Path, height: float, count: int = 2) -> Path:
 
 
 def test_samples_do_not_depend_on_sensor_height(tmp_path):
-    config, samples = tiny(), []
+    config, samples = make_tiny_config(), []
     for height in SENSOR_HEIGHT, 0.6:
         source = open_labelled_frames(low_bag(tmp_path / f"{height}", height)).to_scenes()
         again = pickle.loads(pickle.dumps(source))
@@ -171,7 +171,7 @@ def test_samples_do_not_depend_on_sensor_height(tmp_path):
     assert np.allclose(samples[0].boxes, samples[1].boxes, atol=0.011)
     path = tmp_path / "0.6"
     assert open_labelled_frames(path, height=1.1, with_simulated=True).to_scenes().load_scene(0).height == 1.1
-    folder = object_folder(tmp_path / "kitti", walker_label() + "\n", 1)
+    folder = write_object_folder(tmp_path / "kitti", make_walker_label() + "\n", 1)
     assert open_labelled_frames(folder, height=1.1).to_scenes().load_scene(0).height == 1.1
     mixed = open_labelled_frames(folder, height=1.1, with_simulated=True).to_scenes()
     assert mixed.load_scene(0).height == SENSOR_HEIGHT

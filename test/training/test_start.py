@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from samples import object_folder, scene, walker_label, write
+from samples import make_scene, make_walker_label, write_file, write_object_folder
 
 from lidar_perception.cli.main import cli
 from lidar_perception.detectors.checkpoint import read_header, save_header
@@ -134,7 +134,7 @@ def test_only_temporary_files_of_killed_run_are_removed(tmp_path):
     own_files = [".last.pt.7-1.tmp", "scans/.ab.npz.7-1.tmp", "scans/clusters/.ab.npz.7-2.tmp"]
     other_files = ["notes/.draft.tmp", ".draft.tmp", ".draft.7-1.tmp", "notes/.last.pt.7-1.tmp"]
     for name in (*own_files, *other_files):
-        write(tmp_path / name, "half")
+        write_file(tmp_path / name, "half")
     with RunDirectory(tmp_path).lock():
         assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.tmp")} == {*other_files}
 
@@ -153,7 +153,7 @@ def test_bad_budget_is_rejected(hours, tmp_path):
     ],
 )
 def test_bad_sensor_file_is_rejected(content, reason, tmp_path):
-    path = write(tmp_path / "robot.yaml", content)
+    path = write_file(tmp_path / "robot.yaml", content)
     assert reason in refuse(tmp_path, "--sensor", str(path))
 
 
@@ -170,7 +170,7 @@ def test_full_disk_is_reported_before_simulation(tmp_path, monkeypatch):
 
 def test_resumed_run_keeps_plan_and_rejects_other_settings(tmp_path, one_thread):
     out = tmp_path / "run"
-    sensor = write(
+    sensor = write_file(
         tmp_path / "robot.yaml", "elevations: [2, -3, -8, -13, -18]\nazimuth_step: 1.5\nrate: 10\nheight: 0.9\n"
     )
     arguments = [
@@ -235,14 +235,14 @@ def small_run(kind: str, out: Path, root: Path, *more: str):
 @pytest.mark.parametrize("kind", ["pointpillars", "pointnet"])
 def test_unusable_first_scenes_are_skipped(kind, tmp_path, one_thread):
     """The first scenes are truncated, empty, or lack a label file."""
-    root = object_folder(tmp_path / "kitti", walker_label() + "\n", 6) / "training"
+    root = write_object_folder(tmp_path / "kitti", make_walker_label() + "\n", 6) / "training"
     for number in (0, 2):
-        write(root / f"velodyne/{number:06}.bin", b"cut")
+        write_file(root / f"velodyne/{number:06}.bin", b"cut")
     (root / "label_2/000003.txt").unlink()
     for number in (1, 4):
-        write(root / f"velodyne/{number:06}.bin", scene()[:1000])  # only ground
-        write(root / f"label_2/{number:06}.txt", "")
-    held = write(tmp_path / "val.txt", "000002\n000003\n000004\n")
+        write_file(root / f"velodyne/{number:06}.bin", make_scene()[:1000])  # only ground
+        write_file(root / f"label_2/{number:06}.txt", "")
+    held = write_file(tmp_path / "val.txt", "000002\n000003\n000004\n")
     done = small_run(kind, tmp_path / "run", root, "--val-split", str(held))
     assert done.exit_code == 0, done.exception
     assert done.stderr.count("validation: ") == 2
@@ -250,7 +250,7 @@ def test_unusable_first_scenes_are_skipped(kind, tmp_path, one_thread):
     assert header.training["sensor"] == {"height": SENSOR_HEIGHT}  # no sensor was simulated
     assert header.find_height_mismatch(SENSOR_HEIGHT) is None
     assert "for a sensor at 1.73" in header.find_height_mismatch(0.6)
-    write(held, "000002\n000003\n")
+    write_file(held, "000002\n000003\n")
     refused = small_run(kind, tmp_path / "other", root, "--val-split", str(held)).exception
     assert isinstance(refused, InputError) and "\n" not in str(refused)
     assert "no usable validation frame" in str(refused) and "000002.bin" in str(refused)
@@ -274,13 +274,13 @@ def test_run_is_not_resumed_with_changed_split_or_weights(tmp_path, monkeypatch)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(start, "_prepare_scenes", stop)
-    split = write(tmp_path / "split.txt", "000000\n000001\n000002\n")
+    split = write_file(tmp_path / "split.txt", "000000\n000001\n000002\n")
     init = Path(shutil.copy(find_pointnet_weights(PointNetParams()), tmp_path / "init.safetensors"))
     arguments = [
         "train",
         "pointnet",
         "--data",
-        str(object_folder(tmp_path / "kitti", count=5)),
+        str(write_object_folder(tmp_path / "kitti", count=5)),
         "--split",
         str(split),
         "--init",
@@ -298,9 +298,9 @@ def test_run_is_not_resumed_with_changed_split_or_weights(tmp_path, monkeypatch)
         return str(CliRunner().invoke(cli, arguments).exception)
 
     assert "contains a run" not in resume() + resume()
-    write(split, "000000\n000001\n000003\n")
+    write_file(split, "000000\n000001\n000003\n")
     assert "frame_names" in resume() and "init" not in resume()
-    write(split, "000000\n000001\n000002\n")
+    write_file(split, "000000\n000001\n000002\n")
     save_header(init, replace(read_header(init), commit="another"))
     assert "init_weights" in resume() and "frame" not in resume()
 

@@ -11,7 +11,7 @@ from itertools import islice
 
 import pytest
 import torch
-from training_toy import PARAMS, Toy, equals, rows, same, weights
+from training_toy import PARAMS, Toy, are_equal, are_equal_runs, read_rows, weights
 
 from lidar_perception.runs import files
 from lidar_perception.training import loop
@@ -27,7 +27,7 @@ CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
-def unbroken(tmp_path_factory):
+def uninterrupted_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("unbroken")
     toy = Toy()
     progress = train(toy.task(), PARAMS, folder)
@@ -35,31 +35,31 @@ def unbroken(tmp_path_factory):
     return folder, toy
 
 
-def test_seed_determines_the_run(unbroken, tmp_path):
+def test_seed_determines_the_run(uninterrupted_run, tmp_path):
     train(Toy().task(), PARAMS, tmp_path / "again")
-    assert equals(tmp_path / "again", unbroken[0])
+    assert are_equal_runs(tmp_path / "again", uninterrupted_run[0])
     train(Toy().task(), LoopParams(**{**vars(PARAMS), "seed": 4}), tmp_path / "other")
-    assert rows(tmp_path / "other") != rows(unbroken[0])
+    assert read_rows(tmp_path / "other") != read_rows(uninterrupted_run[0])
 
 
-def test_averaged_weights_are_validated_and_best_are_saved(unbroken):
-    folder, toy = unbroken
-    validated = rows(folder, "validation.csv")
+def test_averaged_weights_are_validated_and_best_are_saved(uninterrupted_run):
+    folder, toy = uninterrupted_run
+    validated = read_rows(folder, "validation.csv")
     assert [int(row["step"]) for row in validated] == [4, 8, 12, 13]
     _, record = toy.saved["best"]
     scores = [float(row["score"]) for row in validated]
     assert record["best_step"] == int(validated[scores.index(max(scores))]["step"])
-    assert same(
+    assert are_equal(
         {f"average.{k}": v for k, v in toy.saved["last"][0].items()},
         {k: v for k, v in weights(folder).items() if k.startswith("average")},
     )
-    losses = [float(row["loss"]) for row in rows(folder)]
+    losses = [float(row["loss"]) for row in read_rows(folder)]
     assert sum(losses[-4:]) < sum(losses[:4])
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("step", [0, 6, 11])
-def test_stopped_and_resumed_run_equals_uninterrupted_run(unbroken, tmp_path, number, step):
+def test_stopped_and_resumed_run_equals_uninterrupted_run(uninterrupted_run, tmp_path, number, step):
     def stop(now):
         if now == step:
             signal.raise_signal(number)
@@ -70,10 +70,10 @@ def test_stopped_and_resumed_run_equals_uninterrupted_run(unbroken, tmp_path, nu
     assert signal.getsignal(number) is before
     progress = train(Toy().task(), PARAMS, tmp_path, resume=True)
     assert (progress.step, progress.stopped) == (13, False)
-    assert equals(tmp_path, unbroken[0])
+    assert are_equal_runs(tmp_path, uninterrupted_run[0])
 
 
-def test_second_signal_ends_run_and_keeps_saved_state(unbroken, tmp_path):
+def test_second_signal_ends_run_and_keeps_saved_state(uninterrupted_run, tmp_path):
     # Background processes of a shell ignore SIGINT.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -88,7 +88,7 @@ def test_second_signal_ends_run_and_keeps_saved_state(unbroken, tmp_path):
     finally:
         signal.signal(signal.SIGINT, before)
     train(Toy().task(), PARAMS, tmp_path, resume=True)
-    assert equals(tmp_path, unbroken[0])
+    assert are_equal_runs(tmp_path, uninterrupted_run[0])
 
 
 def fork(target, *arguments) -> multiprocessing.Process:
@@ -98,7 +98,7 @@ def fork(target, *arguments) -> multiprocessing.Process:
     return process
 
 
-def kill_in(step: int):
+def make_killer(step: int):
     def kill(now):
         if now == step:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -107,20 +107,20 @@ def kill_in(step: int):
 
 
 @pytest.mark.parametrize("step", [2, 8, 10])
-def test_killed_run_loses_at_most_one_save_interval(unbroken, tmp_path, step):
-    process = fork(lambda: train(Toy(kill_in(step)).task(), PARAMS, tmp_path))
+def test_killed_run_loses_at_most_one_save_interval(uninterrupted_run, tmp_path, step):
+    process = fork(lambda: train(Toy(make_killer(step)).task(), PARAMS, tmp_path))
     process.join()
     assert process.exitcode == -signal.SIGKILL
     done = 0
     if (tmp_path / STATE).exists():
         done = torch.load(tmp_path / STATE, weights_only=True)["progress"]["step"]
     assert step - PARAMS.save_steps < done <= step
-    assert len(rows(tmp_path)) == step  # rows are flushed
+    assert len(read_rows(tmp_path)) == step  # rows are flushed
     train(Toy().task(), PARAMS, tmp_path, resume=True)
-    assert equals(tmp_path, unbroken[0])
+    assert are_equal_runs(tmp_path, uninterrupted_run[0])
 
 
-def test_state_is_saved_if_loading_samples_fails(unbroken, tmp_path):
+def test_state_is_saved_if_loading_samples_fails(uninterrupted_run, tmp_path):
     class Short(Toy):
         def batches(self, step):
             yield from islice(super().batches(step), 5)
@@ -130,10 +130,10 @@ def test_state_is_saved_if_loading_samples_fails(unbroken, tmp_path):
         train(Short().task(), PARAMS, tmp_path)
     assert torch.load(tmp_path / STATE, weights_only=True)["progress"]["step"] == 5
     train(Toy().task(), PARAMS, tmp_path, resume=True)
-    assert equals(tmp_path, unbroken[0])
+    assert are_equal_runs(tmp_path, uninterrupted_run[0])
 
 
-def test_full_disk_leaves_last_good_state(unbroken, tmp_path, monkeypatch):
+def test_full_disk_leaves_last_good_state(uninterrupted_run, tmp_path, monkeypatch):
     saved = []
 
     def full(descriptor):
@@ -148,10 +148,10 @@ def test_full_disk_leaves_last_good_state(unbroken, tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.glob(".*")] == []
     assert weights(tmp_path)
     train(Toy().task(), PARAMS, tmp_path, resume=True)
-    assert equals(tmp_path, unbroken[0])
+    assert are_equal_runs(tmp_path, uninterrupted_run[0])
 
 
-def test_run_is_not_overwritten_or_resumed_with_other_settings(unbroken, tmp_path):
+def test_run_is_not_overwritten_or_resumed_with_other_settings(uninterrupted_run, tmp_path):
     folder = tmp_path / "run"
     train(Toy().task(), PARAMS, folder)
     with pytest.raises(InputError, match="--resume"):
@@ -161,7 +161,7 @@ def test_run_is_not_overwritten_or_resumed_with_other_settings(unbroken, tmp_pat
     with pytest.raises(InputError, match="data None, not 'more'"):
         train(Toy().task(data="more"), PARAMS, folder, resume=True)
     train(Toy().task(), LoopParams(**{**vars(PARAMS), "log_steps": 7}), folder, resume=True)
-    assert equals(folder, unbroken[0])  # already finished, so nothing happens
+    assert are_equal_runs(folder, uninterrupted_run[0])  # already finished, so nothing happens
     (folder / STATE).write_bytes((folder / STATE).read_bytes()[:500])
     with pytest.raises(InputError, match="cannot read"):
         train(Toy().task(), PARAMS, folder, resume=True)
@@ -205,7 +205,7 @@ def test_nonfinite_step_changes_only_counters(part):
         **{f"a{k}": v for k, v in run.average.module.state_dict().items()},
         **{f"o{i}{k}": v for i, s in run.optimizer.state_dict()["state"].items() for k, v in s.items()},
     }
-    assert same(before, after)
+    assert are_equal(before, after)
     assert (run.progress.step, run.progress.skipped, run.progress.in_a_row) == (2, 1, 1)
     run = _with_loss(run, loss)
     assert run.step(good) is not None
@@ -250,7 +250,7 @@ def test_two_processes_with_half_batch_equal_one(tmp_path):
     train(Toy(plain=True, size=8).task(), PARAMS, tmp_path / "one")
     one, two = weights(tmp_path / "one"), weights(tmp_path / "two")
     assert all(torch.allclose(one[name], two[name], atol=1e-5) for name in one)
-    assert [row["step"] for row in rows(tmp_path / "two")] == [row["step"] for row in rows(tmp_path / "one")]
+    assert [row["step"] for row in read_rows(tmp_path / "two")] == [row["step"] for row in read_rows(tmp_path / "one")]
 
 
 def test_training_without_torchrun_is_one_process():
@@ -261,14 +261,16 @@ def test_training_without_torchrun_is_one_process():
 # time limit
 
 
-def test_run_out_of_time_validates_saves_and_resumes(unbroken, tmp_path, monkeypatch):
+def test_run_out_of_time_validates_saves_and_resumes(uninterrupted_run, tmp_path, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(loop.time, "monotonic", lambda: now[0])
     toy = Toy(lambda step: now.__setitem__(0, float(step)))
     progress = train(toy.task(), PARAMS, tmp_path, deadline=5.0)
     assert (progress.step, progress.late, progress.stopped) == (6, True, False)
-    assert [int(row["step"]) for row in rows(tmp_path, "validation.csv")] == [4, 6]
+    assert [int(row["step"]) for row in read_rows(tmp_path, "validation.csv")] == [4, 6]
     assert set(toy.saved) == {"best", "last"}
     progress = train(Toy().task(), PARAMS, tmp_path, resume=True)
     assert (progress.step, progress.late) == (13, False)
-    assert same(weights(tmp_path), weights(unbroken[0])) and rows(tmp_path) == rows(unbroken[0])
+    assert are_equal(weights(tmp_path), weights(uninterrupted_run[0])) and read_rows(tmp_path) == read_rows(
+        uninterrupted_run[0]
+    )

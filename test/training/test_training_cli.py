@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from samples import object_folder, walker_label, write
+from samples import make_walker_label, write_file, write_object_folder
 
 from lidar_perception.cli.main import cli
 from lidar_perception.data.open import open_recording
@@ -107,8 +107,8 @@ def test_trained_network_opens_as_detector(tmp_path, cache, tiny_size):
 
 
 def test_broken_scenes_of_a_mixture_are_counted(tmp_path, cache, tiny_size):
-    root = object_folder(tmp_path / "kitti", walker_label() + "\n", 6)
-    write(root / "training/label_2/000002.txt", "Pedestrian 0 0 x\n")
+    root = write_object_folder(tmp_path / "kitti", make_walker_label() + "\n", 6)
+    write_file(root / "training/label_2/000002.txt", "Pedestrian 0 0 x\n")
     result = train(
         *train_on_simulation(cache, tmp_path / "run"),
         "--data",
@@ -133,7 +133,7 @@ def open_data(data, val=(), split=None, val_split=None, **data_params) -> tuple[
 
 
 def test_held_out_frames_are_not_trained_on(tmp_path):
-    root = object_folder(tmp_path, count=5)
+    root = write_object_folder(tmp_path, count=5)
     open_frames = functools.partial(open_data, scans=7, val_scans=2, val_share=0.4)
 
     def count_frames(*arguments) -> list[list[int]]:
@@ -147,7 +147,7 @@ def test_held_out_frames_are_not_trained_on(tmp_path):
     assert count_frames(("sim",), (folder,)) == [[7], [5]]
     (streets,), (others,) = open_frames(("sim",))
     assert streets.first_seed + streets.count <= others.first_seed
-    ours, theirs = write(tmp_path / "a", "000000\n000001\n"), write(tmp_path / "b", "000001\n")
+    ours, theirs = write_file(tmp_path / "a", "000000\n000001\n"), write_file(tmp_path / "b", "000001\n")
     (train_on,), (held,) = open_frames((folder,), (folder,), ours, theirs)
     assert (train_on.names, held.names) == (("000000",), ("000001",))
     (train_on,), (held,) = open_frames((folder,), (), None, theirs)
@@ -161,11 +161,11 @@ def test_held_out_frames_are_not_trained_on(tmp_path):
 
 
 def test_training_and_validation_share_no_frame_by_any_path(tmp_path, monkeypatch):
-    root = object_folder(tmp_path / "kitti", walker_label() + "\n", 5)
+    root = write_object_folder(tmp_path / "kitti", make_walker_label() + "\n", 5)
     write_bag(tmp_path / "bag", open_recording(root))
     (file,) = (tmp_path / "bag").glob("*.mcap")
     monkeypatch.chdir(tmp_path)
-    some = write(tmp_path / "some.txt", "000000\n000001\n")
+    some = write_file(tmp_path / "some.txt", "000000\n000001\n")
     three = [f"{i:06}" for i in (2, 3, 4)]
 
     def names(*arguments) -> list[list[str]]:
@@ -231,7 +231,7 @@ def test_file_as_out_is_rejected_before_simulation(tmp_path, monkeypatch):
         raise AssertionError("data was prepared")
 
     monkeypatch.setattr("lidar_perception.training.start.open_sources", never)
-    file = write(tmp_path / "out", b"")
+    file = write_file(tmp_path / "out", b"")
     for out in (file, file / "below"):
         for kind in ("pointpillars", "pointnet"):
             result = CliRunner().invoke(cli, ["train", kind, "--data", "sim", "--out", str(out)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from detection_samples import BOXES, tiny, two_objects
+from detection_samples import BOXES, make_tiny_config, make_two_objects
 from training_toy import STILL
 
 from lidar_perception.classes import CAR
@@ -21,9 +21,9 @@ pytestmark = [pytest.mark.no_cover, pytest.mark.skipif(not torch.cuda.is_availab
 
 def run_on(device: str, version: str, amp: str) -> tuple[Run, list]:
     torch.manual_seed(0)
-    config = tiny(version)
+    config = make_tiny_config(version)
     scene = TrainingScene(
-        points=two_objects(),
+        points=make_two_objects(),
         boxes=BOXES.numpy().astype(np.float64),
         detectable=np.ones(2, bool),
         class_ids=np.array([CAR, PEDESTRIAN]),

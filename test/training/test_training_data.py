@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from detection_samples import BOXES, anchor_tensors, tiny, two_objects
+from detection_samples import BOXES, make_anchor_tensors, make_tiny_config, make_two_objects
 from samples import WALKER
 from training_toy import STILL, broken_folder, prepare_all
 
@@ -127,7 +127,10 @@ def make_scene(**changes) -> TrainingScene:
     return TrainingScene(
         **{
             **dict(
-                points=two_objects(), boxes=boxes, detectable=np.ones(2, bool), class_ids=np.array([CAR, PEDESTRIAN])
+                points=make_two_objects(),
+                boxes=boxes,
+                detectable=np.ones(2, bool),
+                class_ids=np.array([CAR, PEDESTRIAN]),
             ),
             **changes,
         }
@@ -140,7 +143,7 @@ def to_labels(sample: Sample, anchors: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("version", ["v0", "v2", "v4"])
 def test_samples_have_inputs_of_version(version):
-    config = tiny(version)
+    config = make_tiny_config(version)
     sample = ScenePreparation(config, STILL)(make_scene(), np.random.default_rng(0))
     assert sample.points.shape[1] == config.point_columns
     assert (sample.cluster_map is not None) == config.pseudo_map
@@ -154,13 +157,13 @@ def test_samples_have_inputs_of_version(version):
 
 
 def test_fraction_of_scenes_gets_pasted_objects(tmp_path):
-    cut_objects(make_scene(), tiny().classes, 1).save(tmp_path / "objects.npz")
+    cut_objects(make_scene(), make_tiny_config().classes, 1).save(tmp_path / "objects.npz")
     rng, scene = np.random.default_rng(0), make_scene()
     scene = replace(scene, boxes=scene.boxes[:1], class_ids=scene.class_ids[:1], detectable=scene.detectable[:1])
 
     def numbers(crowded: float) -> list[int]:
         prepare = ScenePreparation(
-            tiny(), replace(STILL, pedestrians=1, crowded=crowded), database=tmp_path / "objects.npz"
+            make_tiny_config(), replace(STILL, pedestrians=1, crowded=crowded), database=tmp_path / "objects.npz"
         )
         return [len(prepare(scene, rng).labels) for _ in range(10)]
 
@@ -169,8 +172,8 @@ def test_fraction_of_scenes_gets_pasted_objects(tmp_path):
 
 
 def test_anchors_on_hidden_objects_are_ignored():
-    config = tiny()
-    anchors, kinds = anchor_tensors(config)
+    config = make_tiny_config()
+    anchors, kinds = make_anchor_tensors(config)
     rng = np.random.default_rng(0)
     whole = ScenePreparation(config, STILL)(make_scene(), rng)
     found = to_labels(whole, anchors)
@@ -190,19 +193,19 @@ def test_anchors_on_hidden_objects_are_ignored():
 
 
 def test_scene_without_points_in_range_is_rejected():
-    behind = make_scene(points=two_objects() * np.array([-1, 1, 1, 1], np.float32))
+    behind = make_scene(points=make_two_objects() * np.array([-1, 1, 1, 1], np.float32))
     with pytest.raises(InputError, match="no point"):
-        ScenePreparation(tiny(), STILL)(behind, np.random.default_rng(0))
-    far = ScenePreparation(tiny(), STILL)(
+        ScenePreparation(make_tiny_config(), STILL)(behind, np.random.default_rng(0))
+    far = ScenePreparation(make_tiny_config(), STILL)(
         make_scene(boxes=BOXES.numpy() + [90, 0, 0, 0, 0, 0, 0]), np.random.default_rng(0)
     )
     assert len(far.boxes) == 0 and len(far.labels) == 0
-    assert (to_labels(far, anchor_tensors(tiny())[0]) == BACKGROUND).all()
+    assert (to_labels(far, make_anchor_tensors(make_tiny_config())[0]) == BACKGROUND).all()
 
 
 def test_validation_scores_of_perfect_and_empty_detections(tmp_path):
     root = broken_folder(tmp_path)
-    scenes = SceneReader((open_labelled_frames(root).to_scenes(),), partial(load_validation_frame, tiny()))
+    scenes = SceneReader((open_labelled_frames(root).to_scenes(),), partial(load_validation_frame, make_tiny_config()))
     right = validate_detector(lambda frame: DetectionResult(Detections.of([WALKER])), scenes)
     blind = validate_detector(lambda frame: DetectionResult(Detections.none()), scenes)
     assert right.compute()["frames"] == 3 and len(right.skipped) == 2
@@ -282,7 +285,7 @@ def test_training_ends_with_reason_if_worker_is_killed(jobs):
 
 def test_samples_do_not_depend_on_sensor_height():
     scene = make_scene()
-    for config in tiny(), tiny("v4"):
+    for config in make_tiny_config(), make_tiny_config("v4"):
         usual = ScenePreparation(config, STILL)(scene, np.random.default_rng(0))
         for height in 0.6, 2.4:
             other = replace(raise_scene(scene, SENSOR_HEIGHT - height), height=height)

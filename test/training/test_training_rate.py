@@ -11,7 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
-from training_toy import PARAMS, Toy, equals, rows, same
+from training_toy import PARAMS, Toy, are_equal, are_equal_runs, read_rows
 
 from lidar_perception.training import loop
 from lidar_perception.training.loop import train
@@ -72,7 +72,7 @@ def test_average_includes_norm_statistics():
     average = WeightAverage(module, 0.0)
     module.train()(torch.randn(8, 2) + 4)
     average.update(module)
-    assert same(average.module.state_dict(), module.state_dict())
+    assert are_equal(average.module.state_dict(), module.state_dict())
     assert not any(p.requires_grad for p in average.module.parameters())
 
 
@@ -125,7 +125,7 @@ def test_slow_run_ends_in_time_at_the_final_learning_rate(seconds, fits, planned
     assert 0.85 * first <= progress.step <= first
     assert 300 <= progress.step + progress.left_out < 301
     assert capsys.readouterr().err.count("steps fit into the budget") == 1
-    rates, whole = ([float(row["lr"]) for row in rows(folder)] for folder in (tmp_path, planned))
+    rates, whole = ([float(row["lr"]) for row in read_rows(folder)] for folder in (tmp_path, planned))
     assert rates[-1] == whole[-1] and max(rates) > 0.95 * max(whole)
     jumps, slope = (max(abs(a - b) for a, b in pairwise(each)) for each in (rates, whole))
     assert jumps < 3 * slope / fits  # no sudden drop
@@ -134,7 +134,7 @@ def test_slow_run_ends_in_time_at_the_final_learning_rate(seconds, fits, planned
 
 def test_sufficient_budget_keeps_the_plan(planned, tmp_path, monkeypatch):
     _, progress = run_timed(lambda _: 1.0, 30.0, tmp_path, monkeypatch, deadline=600.0)
-    assert progress.left_out == 0 and equals(tmp_path, planned)
+    assert progress.left_out == 0 and are_equal_runs(tmp_path, planned)
 
 
 def test_shortened_run_resumes_where_it_stopped(tmp_path, monkeypatch):
@@ -146,7 +146,7 @@ def test_shortened_run_resumes_where_it_stopped(tmp_path, monkeypatch):
     _, before = run_timed(stop, 0.0, tmp_path, monkeypatch, deadline=1500.0)
     assert before.stopped and before.left_out > 10
     progress = train(Toy().task(), PLANNED, tmp_path, resume=True)
-    rates = [float(row["lr"]) for row in rows(tmp_path)]
+    rates = [float(row["lr"]) for row in read_rows(tmp_path)]
     assert progress.left_out == pytest.approx(before.left_out, abs=1)
     assert rates[-1] < 1e-3 * PLANNED.lr and progress.step + progress.left_out >= 300
     assert max(abs(a - b) for a, b in pairwise(rates[45:])) < 0.02 * PLANNED.lr

@@ -7,7 +7,7 @@ import csv
 from pathlib import Path
 
 import torch
-from samples import object_folder, walker_label, write
+from samples import make_walker_label, write_file, write_object_folder
 from torch import nn
 
 from lidar_perception.training.distributed import get_rank, get_world_size
@@ -61,21 +61,21 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
     return {f"{part}.{name}": value for part in ("module", "average") for name, value in state[part].items()}
 
 
-def same(a: dict, b: dict) -> bool:
+def are_equal(a: dict, b: dict) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-def rows(folder: Path, name: str = "log.csv") -> list[dict]:
+def read_rows(folder: Path, name: str = "log.csv") -> list[dict]:
     with open(folder / name) as stream:
         return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(stream)]
 
 
-def equals(folder: Path, other: Path) -> bool:
+def are_equal_runs(folder: Path, other: Path) -> bool:
     """Return True if two runs wrote the same files, apart from durations."""
     return (
-        same(weights(folder), weights(other))
-        and rows(folder) == rows(other)
-        and rows(folder, "validation.csv") == rows(other, "validation.csv")
+        are_equal(weights(folder), weights(other))
+        and read_rows(folder) == read_rows(other)
+        and read_rows(folder, "validation.csv") == read_rows(other, "validation.csv")
     )
 
 
@@ -104,8 +104,8 @@ STILL = AugmentParams(
 
 def broken_folder(root):
     """Write five frames, of which 1 has a broken label file and 3 a truncated scan."""
-    object_folder(root, walker_label() + "\n", 5)
-    write(root / "training/label_2/000001.txt", "Pedestrian 0 0 x\n")
+    write_object_folder(root, make_walker_label() + "\n", 5)
+    write_file(root / "training/label_2/000001.txt", "Pedestrian 0 0 x\n")
     scan = root / "training/velodyne/000003.bin"
     scan.write_bytes(scan.read_bytes()[:-5])
     return root

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import header
-from tracking_samples import START, TENTH, crowd
+from samples import make_any_header
+from tracking_samples import START, TENTH, make_crowd_detections
 
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import Trails
@@ -49,7 +49,7 @@ rows = st.lists(
 def assert_equal_cdr(got: bytes, rows, stamp_ns=START, frame_id="velodyne", lifetime_ns=0):
     """Compare with both serializations; rclpy leaves the bytes of padding undefined."""
     ours, theirs = (
-        rows_to_message(rows, header(make, stamp_ns, frame_id), make, lifetime_ns)
+        rows_to_message(rows, make_any_header(make, stamp_ns, frame_id), make, lifetime_ns)
         for make in (make_bag_message, make_ros_message)
     )
     assert got == encode(ours)
@@ -60,13 +60,13 @@ def assert_equal_cdr(got: bytes, rows, stamp_ns=START, frame_id="velodyne", life
 
 @given(rows=rows, stamp_ns=st.integers(0, 2**60), frame_id=texts, lifetime_ns=st.integers(0, 2**60))
 def test_encoded_markers_equal_the_serialized_message(rows, stamp_ns, frame_id, lifetime_ns):
-    head = header(make_bag_message, stamp_ns, frame_id)
+    head = make_any_header(make_bag_message, stamp_ns, frame_id)
     assert_equal_cdr(encode_markers(rows, head, lifetime_ns), rows, stamp_ns, frame_id, lifetime_ns)
 
 
 def test_encoded_tracks_equal_the_serialized_message():
     tracker, trails, shown = Tracker(), Trails(), ()
-    for i, frame_detections in enumerate(crowd(4, 15)):
+    for i, frame_detections in enumerate(make_crowd_detections(4, 15)):
         stamp = START + i * TENTH
         tracks = tracker(frame_detections if i < 12 else Detections.none(), stamp)
         track_rows = make_track_rows(
@@ -79,13 +79,13 @@ def test_encoded_tracks_equal_the_serialized_message():
         )
         shown = list_marker_keys(track_rows)
         for rows in (track_rows, make_detection_rows(frame_detections)):
-            assert_equal_cdr(encode_markers(rows, header(make_bag_message, stamp)), rows, stamp)
+            assert_equal_cdr(encode_markers(rows, make_any_header(make_bag_message, stamp)), rows, stamp)
     assert shown
 
 
 def test_encoded_empty_array_equals_the_serialized_message():
     rows = make_marker_rows(np.zeros((0, 7)), [])
-    assert_equal_cdr(encode_markers(rows, header(make_bag_message, START)), rows)
+    assert_equal_cdr(encode_markers(rows, make_any_header(make_bag_message, START)), rows)
 
 
 @given(boxes=st.lists(st.tuples(*6 * [numbers], st.floats(-4, 4)), max_size=3), frame_id=texts, seed=st.integers(0, 9))
@@ -96,7 +96,7 @@ def test_encoded_detection_array_equals_the_serialized_message(boxes, frame_id, 
         boxes=boxes,
         labels=rng.choice(CLASSES, count).tolist(),
         scores=rng.random(count),
-        header=header(make_bag_message, START, frame_id),
+        header=make_any_header(make_bag_message, START, frame_id),
         **({"ids": rng.integers(0, 10**5, count), "covariances": rng.random((count, 6, 6))} if seed % 2 else {}),
     )
     assert encode_detection_array(**given) == encode(to_detection_array(**given, make=make_bag_message))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from marker_messages import make_detection_markers
-from samples import CALIBRATION, each_make, header
+from samples import CALIBRATION, each_make, make_any_header
 
 from lidar_perception.camera import Calibration, Camera
 from lidar_perception.intensity import find_scale_problem
@@ -25,9 +25,9 @@ from msg_utils.point_cloud2 import from_array
 
 @each_make
 def test_extrinsics_are_accepted_in_either_direction(make):
-    info = make_camera_info(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)
-    forth = make_extrinsics(CALIBRATION, header(make), make)
-    back = make_extrinsics(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)
+    info = make_camera_info(CALIBRATION, make_any_header(make, frame_id=CAMERA_FRAME), make)
+    forth = make_extrinsics(CALIBRATION, make_any_header(make), make)
+    back = make_extrinsics(CALIBRATION, make_any_header(make, frame_id=CAMERA_FRAME), make)
     back.child_frame_id = "velodyne"
     inverse = np.linalg.inv(CALIBRATION.lidar_to_camera)
     inverse_pose = Calibration(CALIBRATION.intrinsics, inverse, 1, 1).pose
@@ -59,8 +59,8 @@ def test_extrinsics_are_accepted_in_either_direction(make):
     ],
 )
 def test_unusable_camera_raises_input_error(make, change, words):
-    info = make_camera_info(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)
-    transform = make_extrinsics(CALIBRATION, header(make), make)
+    info = make_camera_info(CALIBRATION, make_any_header(make, frame_id=CAMERA_FRAME), make)
+    transform = make_extrinsics(CALIBRATION, make_any_header(make), make)
     change(info, transform)
     with pytest.raises(InputError, match=words):
         read_calibration(info, transform).camera()
@@ -78,16 +78,16 @@ def test_point_is_in_view_if_it_projects_into_the_image():
 MESSAGES = {
     "cloud": lambda make: from_array(
         np.arange(24, dtype="<f4").view([("x", "<f4"), ("", "V4"), ("y", "<f4"), ("z", "<f4")])[["x", "y", "z"]],
-        header(make),
+        make_any_header(make),
         make,
         height=2,
     ),
-    "no points": lambda make: from_array(np.zeros(0, [("x", "<f4")]), header(make), make),
+    "no points": lambda make: from_array(np.zeros(0, [("x", "<f4")]), make_any_header(make), make),
     "markers": lambda make: make_detection_markers(
-        Detections.of([[1, 2, 3, 4, 5, 6, 0.5]] * 2, [3, 0], [0.25, 1]), header(make), make, {("Car", 9)}
+        Detections.of([[1, 2, 3, 4, 5, 6, 0.5]] * 2, [3, 0], [0.25, 1]), make_any_header(make), make, {("Car", 9)}
     ),
-    "camera": lambda make: make_camera_info(CALIBRATION, header(make), make),
-    "transform": lambda make: make_extrinsics(CALIBRATION, header(make), make),
+    "camera": lambda make: make_camera_info(CALIBRATION, make_any_header(make), make),
+    "transform": lambda make: make_extrinsics(CALIBRATION, make_any_header(make), make),
 }
 
 
@@ -138,7 +138,7 @@ def test_truncated_message_raises_input_error():
 @pytest.mark.parametrize("name", ["in_view", "ground", "cluster_id"])
 def test_field_with_several_numbers_per_point_is_rejected(make, name):
     kind = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, "<u4", 2)]
-    msg = from_array(np.ones(3, kind), header(make), make)
+    msg = from_array(np.ones(3, kind), make_any_header(make), make)
     with pytest.raises(InputError, match=f"'{name}' has count > 1"):
         read_column(msg, name, to_point_cloud(msg)[1])
 
@@ -149,15 +149,15 @@ def test_intensities_of_every_driver_are_scaled_to_1(kind, full):
     expected[0] = 1.0
     points = np.ones(len(expected), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", kind)])
     points["intensity"] = np.round(expected * full) if full > 1 else expected
-    read = to_point_cloud(from_array(points, header(make_bag_message), make_bag_message), 0.0)[0]
+    read = to_point_cloud(from_array(points, make_any_header(make_bag_message), make_bag_message), 0.0)[0]
     np.testing.assert_allclose(read.intensity, expected, atol=0.5 / 255)
     assert read.intensity.dtype == np.float32 and find_scale_problem(read.intensity) is None
     if np.dtype(kind).kind == "f":
         points["intensity"][1:4] = np.nan, np.inf, -np.inf
-        odd = to_point_cloud(from_array(points, header(make_bag_message), make_bag_message), 0.0)[0].intensity
+        odd = to_point_cloud(from_array(points, make_any_header(make_bag_message), make_bag_message), 0.0)[0].intensity
         assert not odd[1:4].any() and np.array_equal(odd[4:], read.intensity[4:])
     points["intensity"] = points["intensity"] * 0.02  # an unusual scale
-    dark = to_point_cloud(from_array(points, header(make_bag_message), make_bag_message), float(full))[0]
+    dark = to_point_cloud(from_array(points, make_any_header(make_bag_message), make_bag_message), float(full))[0]
     assert "input.intensity_max" in find_scale_problem(dark.intensity)
     assert "input.intensity_max" in find_scale_problem(read.intensity * 2)
     assert find_scale_problem(dark.intensity[:100]) is None

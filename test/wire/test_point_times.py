@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from samples import STAMP, header
+from samples import STAMP, make_any_header
 
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import make_bag_message
@@ -35,7 +35,7 @@ def cloud(name, values, order="<"):
         [("x", f"{order}f4"), ("y", f"{order}f4"), ("z", f"{order}f8"), ("intensity", f"{order}f4"), (name, kind)],
     )
     points["x"], points["y"], points[name] = 5.0, np.arange(len(values)), values
-    return from_array(points, header(make_bag_message), make_bag_message)
+    return from_array(points, make_any_header(make_bag_message), make_bag_message)
 
 
 def all_indices(msg):
@@ -107,7 +107,7 @@ def test_unusable_times_are_reported(name, values, words):
         len(values), [(n, "<f4") for n in ("x", "y", "z", "intensity")] + [(name, values.dtype, values.shape[1:])]
     )
     points[name] = values
-    msg = from_array(points, header(make_bag_message), make_bag_message)
+    msg = from_array(points, make_any_header(make_bag_message), make_bag_message)
     with pytest.raises(InputError, match=words):
         read_point_times(msg, all_indices(msg))
 

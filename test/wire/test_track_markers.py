@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from marker_messages import make_track_markers
 from robot_bags import read_pose
-from samples import each_make, header
-from tracking_samples import CAR, START, TENTH, crowd, pose
+from samples import each_make, make_any_header
+from tracking_samples import CAR, START, TENTH, make_crowd_detections, make_flat_pose
 
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import Trails
@@ -20,7 +20,7 @@ from msg_utils.markers import ADD, DELETE, from_marker_array, list_marker_keys
 def make_frames(make, frames=20):
     """Yield the tracks and markers of each frame; each array gets the previous one."""
     tracker, trails, shown = Tracker(), Trails(), ()
-    for i, frame_detections in enumerate(crowd(4, frames)):
+    for i, frame_detections in enumerate(make_crowd_detections(4, frames)):
         stamp = START + i * TENTH
         tracks = tracker(frame_detections if i < 12 else Detections.none(), stamp)
         message = make_track_markers(
@@ -29,7 +29,7 @@ def make_frames(make, frames=20):
             tracks.velocities,
             tracks.moving,
             trails(tracks, tracker.pose, stamp, 2.0),
-            header(make, stamp),
+            make_any_header(make, stamp),
             make,
             previous=shown,
             lifetime_ns=10**9,
@@ -79,7 +79,7 @@ def test_large_ids_wrap_around():
         np.zeros((1, 2)),
         np.zeros(1),
         [np.zeros((1, 3))],
-        header(make_bag_message),
+        make_any_header(make_bag_message),
         make_bag_message,
     )
     assert {(m.ns, m.id) for m in message.markers} == {(CLASSES[CAR], 7), (NUMBER, 7)}
@@ -88,7 +88,7 @@ def test_large_ids_wrap_around():
 
 @each_make
 def test_odometry_message_has_the_pose(make):
-    at = pose(3.0, -4.0, 2.5)
-    message = make_odometry(at, header(make, frame_id="odom"), "velodyne", make)
+    at = make_flat_pose(3.0, -4.0, 2.5)
+    message = make_odometry(at, make_any_header(make, frame_id="odom"), "velodyne", make)
     np.testing.assert_allclose(read_pose(message.pose.pose), at, atol=1e-12)
     assert (message.header.frame_id, message.child_frame_id) == ("odom", "velodyne")
