@@ -68,15 +68,12 @@ NETWORKS = tuple(name for name, nodes in SINGLE_PROCESS_NODES.items() if f"{name
 
 
 def build_graph(detectors: Sequence[str], single: bool = False, tracking: bool = False) -> dict[str, Mapping[str, str]]:
-    """Return the graph of one or more detectors; nodes that they share appear once.
+    """Return {node: {topic: remapped topic}} for one or more detectors; nodes that they share appear once.
 
     Args:
         detectors: names of detectors, keys of DETECTOR_NODES.
         single: let each detector compute ground and clusters itself, in one process.
         tracking: add a tracker for each detector.
-
-    Returns:
-        {node: {topic: remapped topic}}
 
     Raises:
         InputError: a detector is unknown.
@@ -94,13 +91,9 @@ def build_graph(detectors: Sequence[str], single: bool = False, tracking: bool =
 def find_expert_range(detectors: Sequence[str], params: Mapping[str, Any]) -> str:
     """Return the value of the parameter `range` of ground_segmentation.
 
-    Args:
-        detectors: names of detectors.
-        params: parameters of the detectors. With range auto, the packaged weights detect ahead.
-
-    Returns:
-        ahead or around if all detectors use that range; all if the ranges differ, or if a detector
-        needs the full cloud or has its own weights.
+    It is ahead or around if all detectors use that range. It is all if the ranges differ, or if a
+    detector needs the full cloud or has its own weights. With range auto, the packaged weights
+    detect ahead.
     """
     ranges = set()
     for name in detectors:
@@ -332,14 +325,14 @@ class Processes:
                 command, env=self.environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
             )
 
-    def check(self, *finished: str) -> None:
+    def check(self, *finite_nodes: str) -> None:
         """Raise InputError with the last log line of a node that has ended.
 
-        finished: nodes that may have ended with exit code 0.
+        finite_nodes: nodes that may have ended with exit code 0.
         """
         for node, process in self.running.items():
             code = process.poll()
-            if code is not None and (node not in finished or code):
+            if code is not None and (node not in finite_nodes or code):
                 lines = (self.logs / f"{node}.log").read_text().strip().splitlines() or ["no log"]
                 raise InputError(f"{node} ended with code {code}: {lines[-1]} (log: {self.logs / node}.log)")
 

@@ -36,17 +36,17 @@ def test_player_limits_clouds_in_flight():
         def serve(pace=pace, topics=topics):
             nonlocal answers
             number, topic = int(rng.integers(0, 40)), str(rng.choice(topics))
-            before = len(pace.waiting)
+            before = len(pace.unanswered_clouds)
             pace.add_answer(make_stamp(number), topic)
-            assert len(pace.waiting) <= before
+            assert len(pace.unanswered_clouds) <= before
             answers += 1
 
         for number in range(40):
             pace.wait_for_room(serve, lambda: False)
-            assert len(pace.waiting) < ahead
+            assert len(pace.unanswered_clouds) < ahead
             pace.add_cloud(b"\0" * 4 + make_stamp(number))
-            assert list(pace.waiting)[-1] == make_stamp(number)
-        assert answers and pace.unanswered <= 40 * len(topics)
+            assert list(pace.unanswered_clouds)[-1] == make_stamp(number)
+        assert answers and pace.missing_answers <= 40 * len(topics)
 
 
 def test_answer_marks_earlier_clouds_as_missed():
@@ -54,9 +54,9 @@ def test_answer_marks_earlier_clouds_as_missed():
     for number in range(3):
         pace.add_cloud(b"\0" * 4 + make_stamp(number))
     pace.add_answer(make_stamp(0), "/a")
-    assert pace.unanswered == 0 and list(pace.waiting) == [make_stamp(1), make_stamp(2)]
+    assert pace.missing_answers == 0 and list(pace.unanswered_clouds) == [make_stamp(1), make_stamp(2)]
     pace.add_answer(make_stamp(2), "/a")
-    assert pace.unanswered == 1 and not pace.waiting
+    assert pace.missing_answers == 1 and not pace.unanswered_clouds
 
 
 def test_player_waits_full_timeout_only_once(monkeypatch):
@@ -71,10 +71,10 @@ def test_player_waits_full_timeout_only_once(monkeypatch):
     for number in range(5):
         pace.wait_for_room(serve, lambda: False)
         pace.add_cloud(b"\0" * 4 + make_stamp(number))
-    assert pace.unanswered == 4 and 8 + 3 < pace.held <= 8 + 3 + 4 * 0.25
-    held = pace.held
+    assert pace.missing_answers == 4 and 8 + 3 < pace.held_s <= 8 + 3 + 4 * 0.25
+    held = pace.held_s
     pace.wait_for_answers(serve, lambda: False)
-    assert pace.unanswered == 5 and not pace.waiting and pace.held == held
+    assert pace.missing_answers == 5 and not pace.unanswered_clouds and pace.held_s == held
 
 
 def test_cloud_topics_are_found_or_the_existing_ones_are_listed():

@@ -200,7 +200,7 @@ def test_bag_time_follows_the_rate_and_stops_while_paused(monkeypatch):
     from lidar_perception.params import PlayerParams
 
     player = bag_player.BagPlayer.__new__(bag_player.BagPlayer)
-    player.now_ns, player.anchor, player.is_paused, player.clock = START, 50.0, False, None
+    player.now_ns, player.last_advance, player.is_paused, player.clock = START, 50.0, False, None
     player.params = PlayerParams(rate=2.5)
     monkeypatch.setattr(bag_player, "monotonic", lambda: 54.0)
     player._advance()
@@ -219,7 +219,7 @@ def test_clock_keeps_its_rate_between_rare_messages(monkeypatch):
     from lidar_perception.params import PlayerParams
 
     player, now, sent = bag_player.BagPlayer.__new__(bag_player.BagPlayer), [50.0], []
-    player.now_ns, player.anchor, player.is_paused, player.steps = START, now[0], False, 0
+    player.now_ns, player.last_advance, player.is_paused, player.steps = START, now[0], False, 0
     player.params, player.next_clock = PlayerParams(clock_hz=100.0), 0.0
     player.clock, player.stop = SimpleNamespace(publish=sent.append), Future()
     monkeypatch.setattr(bag_player, "monotonic", lambda: now[0])
@@ -352,7 +352,7 @@ def test_looped_bag_of_one_message_does_not_busy_loop(monkeypatch, tmp_path):
     monkeypatch.setattr(bag_player, "monotonic", lambda: now[0])
 
     def play():
-        player.now_ns, player.anchor = START, now[0]
+        player.now_ns, player.last_advance = START, now[0]
         for late in range(200):  # like a rate that is too high
             if not player._wait_until(START - late, "/text"):
                 return

@@ -59,7 +59,7 @@ def test_recording_continues_if_a_type_is_not_installed(monkeypatch, peer, start
     peer.advertise("/info", INFO)
     peer.advertise("/text", TEXT)
     node = start_node(bag_recorder.BagRecorder, bag=str(tmp_path / "bag"), topics=("/info", "/text"))
-    peer.wait(lambda: [node._discover(), not node.waiting][1], "both to be found")
+    peer.wait(lambda: [node._discover(), not node.waiting_topics][1], "both to be found")
     node.close()
     with Bag(tmp_path / "bag") as bag:
         assert list(bag.topics) == ["/text"]
@@ -69,7 +69,7 @@ def test_slow_recorder_drops_and_reports_messages(monkeypatch, start_node, tmp_p
     """Also while simulated time does not advance."""
     from lidar_perception.nodes.replay import bag_recorder
 
-    monkeypatch.setattr(bag_recorder, "MAX_QUEUED", 100)
+    monkeypatch.setattr(bag_recorder, "MAX_QUEUED_BYTES", 100)
     held = threading.Event()
     monkeypatch.setattr(bag_recorder.BagWriter, "write", lambda *_: held.wait())
     kept = []
@@ -81,7 +81,7 @@ def test_slow_recorder_drops_and_reports_messages(monkeypatch, start_node, tmp_p
     node = start_node(
         bag_recorder.BagRecorder, **{"bag": str(tmp_path / "bag"), "topics": ["/a"], "use_sim_time": True}
     )
-    node.kind_by_topic["/a"] = None
+    node.class_by_topic["/a"] = None
     node._subscribe("/a")
     try:
         for _ in range(10):

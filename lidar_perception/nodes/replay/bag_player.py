@@ -1,4 +1,4 @@
-"""Node that plays a bag. It publishes the recorded bytes; only other cloud types are converted."""
+"""Node that plays a bag. It publishes the recorded bytes, except that other cloud types become PointCloud2."""
 
 from __future__ import annotations
 
@@ -54,7 +54,9 @@ class BagPlayer(LidarNode):
             self.get_logger().warning(str(warning.message))
         # Topics whose clouds are converted to PointCloud2.
         self.converted_topics = {t for t in find_cloud_topics(self.bag.topics) if self.bag.topics[t] != POINT_CLOUD}
-        self.kinds = {t: POINT_CLOUD if t in self.converted_topics else kind for t, kind in self.bag.topics.items()}
+        self.types = {
+            t: POINT_CLOUD if t in self.converted_topics else type_name for t, type_name in self.bag.topics.items()
+        }
         # True if clouds wait for the answers to earlier clouds.
         self.follows = bool(self.params.follow and self.params.ahead)
         self.names = self._select_topics()
@@ -78,9 +80,9 @@ class BagPlayer(LidarNode):
         self.warned_topics: set[str] = set()  # topics with skipped messages
         self.steps = 0  # requested steps that are not played yet
         self.step_topic = max(
-            self.publishers_by_topic, key=lambda t: (self.kinds[t] == POINT_CLOUD, self.bag.counts[t])
+            self.publishers_by_topic, key=lambda t: (self.types[t] == POINT_CLOUD, self.bag.counts[t])
         )
-        self.now_ns, self.anchor = self.start_ns, monotonic()
+        self.now_ns, self.last_advance = self.start_ns, monotonic()  # bag time, and when it was last advanced
         self.pace = Pace(self, self.params.follow, self.params.ahead, self.params.follow_timeout)
         self.clock = self.params.clock_hz and self.create_publisher(Clock, "/clock", RELIABLE)
         self.next_clock, self.last_service = 0.0, 0.0  # monotonic times
@@ -101,14 +103,15 @@ class BagPlayer(LidarNode):
             if not separator or old not in names:
                 raise InputError(f"remap '{rule}' must be OLD:=NEW with one of the topics {', '.join(names)}")
             names[old] = new
-        expanded = {topic: self._expand_name(name, f"the topic {topic}") for topic, name in names.items()}
-        kinds: dict[str, str] = {}
-        for topic, name in expanded.items():
-            if kinds.setdefault(name, self.kinds[topic]) != self.kinds[topic]:
+        full_names = {topic: self._expand_name(name, f"the topic {topic}") for topic, name in names.items()}
+        type_by_name: dict[str, str] = {}
+        for topic, name in full_names.items():
+            if type_by_name.setdefault(name, self.types[topic]) != self.types[topic]:
                 raise InputError(
-                    f"{name} would have the types {kinds[name]} and {self.kinds[topic]}; remap {topic} to another name"
+                    f"{name} would have the types {type_by_name[name]} and {self.types[topic]}; "
+                    f"remap {topic} to another name"
                 )
-        return expanded
+        return full_names
 
     def _expand_name(self, name: str, what: str) -> str:
         """Return the full name of a topic; relative names are in the namespace of the node."""
@@ -130,25 +133,23 @@ class BagPlayer(LidarNode):
         return counts
 
     def _make_publisher(self, topic: str) -> Any:
-        kind = self.kinds[topic]
+        type_name = self.types[topic]
         try:
             return self.outputs.advertise(
                 self.names[topic],
-                kind,
+                type_name,
                 _make_qos(self.bag.qos(topic), self._count_latched(topic), lossless=self.follows),
             ).publisher
         except (ModuleNotFoundError, AttributeError):
-            self.get_logger().warning(f"{topic} is not played: {kind} is not installed on this machine")
+            self.get_logger().warning(f"{topic} is not played: {type_name} is not installed on this machine")
             return None
 
     def _is_latched(self, topic: str) -> bool:
         return any(q.durability.name == "TRANSIENT_LOCAL" for q in self.bag.qos(topic))
 
     def _count_latched(self, topic: str) -> int:
-        """Return the number of messages of a latched topic that are valid at a time.
-
-        Only the last message is valid, except for transforms, which several nodes publish.
-        """
+        """Return how many of the last messages of a latched topic are valid: one, or for transforms, which several
+        nodes publish, more."""
         return STATIC_QOS.depth if self.bag.topics[topic] == TF_MESSAGE else 1
 
     def spin(self, executor: Executor) -> None:
@@ -223,7 +224,7 @@ class BagPlayer(LidarNode):
 
     def _play_once(self) -> None:
         self._publish_latched()
-        self.now_ns, self.anchor = self.start_ns, monotonic()
+        self.now_ns, self.last_advance = self.start_ns, monotonic()
         for topic, stamp, data in self.bag.raw_messages(self.publishers_by_topic, self.start_ns, self.stop_ns):
             if not self._wait_until(stamp, topic):
                 return
@@ -252,11 +253,11 @@ class BagPlayer(LidarNode):
             return None
 
     def _follow(self, cloud: bytes) -> None:
-        """Wait until the graph has caught up. The time of the bag does not advance while waiting."""
+        """Wait until the graph has caught up; meanwhile the bag time stands still."""
         if self.follows:
             self._advance()
             self.pace.wait_for_room(self._serve_answers, self.stop.done)
-            self.anchor = monotonic()
+            self.last_advance = monotonic()
         self.pace.add_cloud(cloud)
         self._count_pace()
 
@@ -272,9 +273,9 @@ class BagPlayer(LidarNode):
         if self.follows:
             duration = max((self.now_ns - self.start_ns) / SECOND_NS / self.params.rate, 1e-9)
             self.diagnostics.counts.update(
-                unanswered=self.pace.unanswered,
-                held_s=f"{self.pace.held:.2f}",
-                slower=f"{(duration + self.pace.held) / duration:.2f}",
+                unanswered=self.pace.missing_answers,
+                held_s=f"{self.pace.held_s:.2f}",
+                slower=f"{(duration + self.pace.held_s) / duration:.2f}",
             )
 
     def _publish_latched(self) -> None:
@@ -290,7 +291,7 @@ class BagPlayer(LidarNode):
                     self.publishers_by_topic[topic].publish(message)
 
     def _wait_until(self, stamp: int, topic: str) -> bool:
-        """Spin until the time of the bag is `stamp`; return False if the node should end."""
+        """Spin until the bag time reaches `stamp`; return False if the node should end."""
         while not self.stop.done():
             self._advance()
             if self.steps and self.is_paused:
@@ -309,11 +310,11 @@ class BagPlayer(LidarNode):
         return False
 
     def _advance(self) -> None:
-        """Advance the time of the bag by the elapsed time, multiplied by the rate."""
+        """Advance the bag time by the elapsed time, multiplied by the rate."""
         now = monotonic()
         if not self.is_paused:
-            self.now_ns += int((now - self.anchor) * self.params.rate * SECOND_NS)
-        self.anchor = now
+            self.now_ns += int((now - self.last_advance) * self.params.rate * SECOND_NS)
+        self.last_advance = now
         self._publish_clock()
 
     def _publish_clock(self) -> None:
@@ -360,8 +361,7 @@ def _make_qos(profiles: list, latched_count: int, lossless: bool) -> QoSProfile:
 
     Args:
         profiles: recorded profiles of the publishers; if empty, the result is reliable and volatile.
-        latched_count: number of messages of a latched topic that a late subscriber gets, at least
-            ten.
+        latched_count: number of messages of a latched topic that a late subscriber gets.
         lossless: reliable even if the recorded publishers were not.
     """
     if not profiles:

@@ -24,7 +24,7 @@ from msg_utils.messages import load_message_class
 
 LATCHED = DurabilityPolicy.TRANSIENT_LOCAL
 DEPTH = 100  # queue depth of each subscription, large enough for a busy machine
-MAX_QUEUED = 256 * 2**20  # maximum number of bytes to be written; further messages are dropped and counted
+MAX_QUEUED_BYTES = 256 * 2**20  # maximum size of the queue; further messages are dropped and counted
 WRITER_NICENESS = 10  # added to that of the nodes, whose results would be late if compression took their core
 DISCOVERY_PERIOD_S = 0.2  # pause between searches for publishers of the remaining topics
 
@@ -44,17 +44,17 @@ class BagRecorder(LidarNode):
             raise InputError("parameters 'bag' and 'topics' are required")
         self.writer = BagWriter(self.params.bag, compression=self.params.compression)
         self.writer.__enter__()
-        self.waiting = list(dict.fromkeys(map(self.resolve_topic_name, self.params.topics)))
-        self.kind_by_topic: dict[str, type] = {}  # topic -> message class, for the recorded topics
+        self.waiting_topics = list(dict.fromkeys(map(self.resolve_topic_name, self.params.topics)))
+        self.class_by_topic: dict[str, type] = {}  # message class of each recorded topic
         self.subscription_by_topic: dict[str, Any] = {}
         self.link_by_topic: dict[str, tuple[Output, Receive]] = {}
         self.incompatible: set[str] = set()  # topics with a publisher of weaker QoS
         self.queue: queue.Queue = queue.Queue()
-        # Numbers of bytes; of linked messages, only clouds count. One thread or the lock protects each counter.
-        self.queued, self.written = 0, 0
+        # Of messages from links, only clouds count. Each counter is changed by one thread or under the lock.
+        self.queued_bytes, self.written_bytes = 0, 0
         self.lock = threading.Lock()
         self.diagnostics.counts.update(lost=0, dropped=0)
-        self.reported = 0  # number of lost and dropped messages already reported
+        self.reported_count = 0  # number of lost and dropped messages already reported
         self.failure: Exception | None = None
         self.thread = threading.Thread(target=self._write)
         self.thread.start()
@@ -68,36 +68,35 @@ class BagRecorder(LidarNode):
                 f"{self.writer.partial}"
             )
         types = dict(self.get_topic_names_and_types())
-        for topic in [t for t in self.waiting if t in types]:
-            offered = [i.qos_profile for i in self.get_publishers_info_by_topic(topic)]
-            if not offered:
+        for topic in [t for t in self.waiting_topics if t in types]:
+            if not self.count_publishers(topic):
                 continue
-            self.waiting.remove(topic)
-            if (kind := self._find_class(types[topic][0])) is None:
+            self.waiting_topics.remove(topic)
+            if (message_class := self._find_class(types[topic][0])) is None:
                 self.get_logger().warning(
                     f"{topic} is not recorded: {types[topic][0]} is unknown or not installed on this machine"
                 )
                 continue
-            self.kind_by_topic[topic] = kind
+            self.class_by_topic[topic] = message_class
             self._subscribe(topic)
             subscription = self.subscription_by_topic.get(topic)
-            latched = subscription is not None and subscription.qos_profile.durability == LATCHED
-            self.queue.put(("topic", topic, types[topic][0], LATCHED_QOS if latched else SENSOR_QOS))
-        for topic in self.kind_by_topic:
+            is_latched = subscription is not None and subscription.qos_profile.durability == LATCHED
+            self.queue.put(("topic", topic, types[topic][0], LATCHED_QOS if is_latched else SENSOR_QOS))
+        for topic in self.class_by_topic:
             if topic in self.incompatible or self._find_output(topic) is not self.link_by_topic.get(topic, (None,))[0]:
                 self._unsubscribe(topic)
                 self._subscribe(topic)
-        missing = self.diagnostics.counts["lost"] + self.diagnostics.counts["dropped"]
-        if missing > self.reported:
-            self.reported = missing
+        missing_count = self.diagnostics.counts["lost"] + self.diagnostics.counts["dropped"]
+        if missing_count > self.reported_count:
+            self.reported_count = missing_count
             self.diagnostics.report(
                 WARN,
                 f"{self.diagnostics.counts['lost']} messages were lost in transit and "
                 f"{self.diagnostics.counts['dropped']} dropped because the disk is too slow; "
                 "record fewer topics or use a faster disk",
             )
-        elif self.waiting:
-            self.diagnostics.report(WARN, f"waiting for {', '.join(self.waiting)}", expected=True)
+        elif self.waiting_topics:
+            self.diagnostics.report(WARN, f"waiting for {', '.join(self.waiting_topics)}", expected=True)
         else:
             self.diagnostics.report(OK, "recording")
 
@@ -123,19 +122,19 @@ class BagRecorder(LidarNode):
             self.link_by_topic[topic] = output, receive
             self.links.connect(output, receive)
             return
-        offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
+        profiles = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
         qos = QoSProfile(
             depth=DEPTH,
             reliability=(
                 ReliabilityPolicy.RELIABLE
-                if all(q.reliability == ReliabilityPolicy.RELIABLE for q in offered)
+                if all(q.reliability == ReliabilityPolicy.RELIABLE for q in profiles)
                 else ReliabilityPolicy.BEST_EFFORT
             ),
-            durability=(LATCHED if all(q.durability == LATCHED for q in offered) else DurabilityPolicy.VOLATILE),
+            durability=(LATCHED if all(q.durability == LATCHED for q in profiles) else DurabilityPolicy.VOLATILE),
         )
         on_message: Any = receive  # rclpy's type annotation lacks functools.partial
         self.subscription_by_topic[topic] = self.create_subscription(
-            self.kind_by_topic[topic],
+            self.class_by_topic[topic],
             topic,
             on_message,
             qos,
@@ -156,12 +155,12 @@ class BagRecorder(LidarNode):
         """Queue a message for the writing thread. For links, the threads of the publishers call this."""
         size = len(message if isinstance(message, bytes) else getattr(message, "data", b""))
         with self.lock:
-            waiting = self.queued - self.written
-            if waiting and waiting + size > MAX_QUEUED:
+            waiting_bytes = self.queued_bytes - self.written_bytes
+            if waiting_bytes and waiting_bytes + size > MAX_QUEUED_BYTES:
                 self.diagnostics.counts["dropped"] += 1
                 return
             self.diagnostics.counts["frames"] += 1
-            self.queued += size
+            self.queued_bytes += size
         self.queue.put(("message", topic, self.get_clock().now().nanoseconds, message, size))
 
     def _write(self) -> None:
@@ -169,13 +168,13 @@ class BagRecorder(LidarNode):
             os.setpriority(os.PRIO_PROCESS, 0, min(os.getpriority(os.PRIO_PROCESS, 0) + WRITER_NICENESS, 19))
         try:
             while (item := self.queue.get()) is not None:
-                what, topic, *rest = item
-                if what == "topic":
+                action, topic, *rest = item
+                if action == "topic":
                     self.writer.add_topic(topic, *rest)
                 else:
                     stamp, message, size = rest
                     self.writer.write(topic, stamp, to_cdr(message))
-                    self.written += size
+                    self.written_bytes += size
         except Exception as error:  # such as a full disk; the timer ends the node
             self.failure = error
 

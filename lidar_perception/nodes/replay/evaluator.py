@@ -71,14 +71,14 @@ class Evaluator(LidarNode):
             _warm_up()  # before the inputs are created, because bag_player waits for these
         for name in self.frame_inputs:
             self.inputs.subscribe(name, MARKERS, lambda m, n=name: self._add(n, m), LOSSLESS_QOS)
-        for topic, kind in (
+        for topic, type_name in (
             ("camera_info", "sensor_msgs/msg/CameraInfo"),
             ("extrinsics", "geometry_msgs/msg/TransformStamped"),
         ):
-            self.inputs.subscribe(topic, kind, partial(self._on_camera, topic), LATCHED, SENSOR_DATA)
+            self.inputs.subscribe(topic, type_name, partial(self._on_camera, topic), LATCHED, SENSOR_DATA)
         for topic in self.params.timing:
-            *_, node, _, what = topic.split("/")  # .../NODE/debug/WHAT
-            name = node if what == "processing_time_ms" else what.removesuffix("_ms")
+            *_, node, _, quantity = topic.split("/")  # .../NODE/debug/QUANTITY
+            name = node if quantity == "processing_time_ms" else quantity.removesuffix("_ms")
             self.inputs.subscribe(
                 topic, "std_msgs/msg/Float64", lambda m, n=name: self._add_time(n, m.data), LOSSLESS_QOS, private=False
             )
@@ -112,14 +112,14 @@ class Evaluator(LidarNode):
                 else "no frame with a Pedestrian yet",
             )
         while len(self.incomplete_frames) > MAX_INCOMPLETE_FRAMES:
-            oldest = next(iter(self.incomplete_frames))
-            missing = [n for n in self.frame_inputs if n not in self.incomplete_frames[oldest]]
-            self._finish(oldest)
+            oldest_stamp = next(iter(self.incomplete_frames))
+            missing_inputs = [n for n in self.frame_inputs if n not in self.incomplete_frames[oldest_stamp]]
+            self._finish(oldest_stamp)
             self.diagnostics.counts["incomplete"] += 1
             self.diagnostics.report(
                 WARN,
                 f"some frames are not scored because they have no message on "
-                f"{self._join_topics(missing)} with the same header.stamp; stamps must be equal "
+                f"{self._join_topics(missing_inputs)} with the same header.stamp; stamps must be equal "
                 "to the nanosecond",
             )
 
@@ -271,8 +271,8 @@ def _check_params(params: EvaluatorParams) -> None:
     for name in params.classes:
         if name not in DETECTED:
             raise make_unknown_name_error("class", name, [*DETECTED])
-    if invalid := [topic for topic in params.timing if topic.count("/") < 2]:
-        raise InputError(f"timing: {invalid[0]} does not have the form .../NODE/debug/NAME")
+    if invalid_topics := [topic for topic in params.timing if topic.count("/") < 2]:
+        raise InputError(f"timing: {invalid_topics[0]} does not have the form .../NODE/debug/NAME")
     if params.file and (
         Path(params.file).is_dir() or (Path(params.file).parent.exists() and not Path(params.file).parent.is_dir())
     ):
