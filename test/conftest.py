@@ -37,8 +37,8 @@ def pytest_itemcollected(item):
 def pytest_collection_finish():
     """Initialize autograd before all tests, and exclude imported objects from garbage collection.
 
-    Autograd counts its devices at the first backward pass. After an ONNX export, a CUDA build of torch counts a
-    missing device and then fails in the forked processes of tests.
+    Autograd counts the devices in its first backward pass. After an ONNX export, a CUDA build of torch would count
+    a device that does not exist, and backward passes in forked processes would fail.
     """
     if (torch := sys.modules.get("torch")) is not None:
         torch.ones((), requires_grad=True).backward()
@@ -82,7 +82,7 @@ def data() -> Path:
 
 @pytest.fixture
 def keep_ego_detections(monkeypatch):
-    """Keep detections at the ego vehicle, where networks with random weights also find objects."""
+    """Keep detections of the ego vehicle, because networks with random weights detect objects there, too."""
     from lidar_perception.detectors import normalized_view
 
     monkeypatch.setattr(normalized_view, "drop_ego_vehicle", lambda detections, height: detections)

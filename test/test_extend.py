@@ -58,7 +58,7 @@ def apply_example(copy: Path, name: str) -> list[str]:
                 after = lines.index(line[1:])
                 del lines[after]
             elif line.startswith("+"):
-                if after is None:  # an import line, inserted anywhere among the imports
+                if after is None:  # an import line may be inserted anywhere among the imports
                     after = next(i for i, old in enumerate(lines) if old.startswith("from lidar"))
                 lines.insert(after, line[1:])
                 after = None

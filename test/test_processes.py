@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def hold_semaphores() -> Callable[[int], bytes]:
-    """Hold many semaphores; each result is larger than the buffer of a pipe."""
+    """Create many semaphores; each result is larger than the buffer of a pipe."""
     SEMAPHORES.extend(multiprocessing.get_context("forkserver").Semaphore() for _ in range(40))
     return lambda item: bytes(300_000)
 
@@ -55,7 +55,7 @@ def run_script(script: str, **environment: str) -> subprocess.CompletedProcess:
 
 @pytest.mark.skipif(os.cpu_count() == 1, reason="has one core")
 def test_processes_that_share_cores_use_one_thread_each():
-    """Waiting threads of linear algebra libraries use CPU time."""
+    """Threads of linear algebra libraries use CPU time while they wait."""
     script = (
         "from lidar_perception.runs.processes import run_in_order, run_in_processes\n"
         "from test_processes import count_threads\n"

@@ -44,7 +44,7 @@ STEP = np.radians([METRIC.resolution.azimuth_step, METRIC.resolution.elevation_s
 
 
 def make_board(distance, width=0.5, height=1.7, bearing=0.0, offset=0.3):
-    """Return points of an upright board at this distance, sampled with METRIC's resolution."""
+    """Return points of an upright board at a distance, as dense as silhouettes in metres need."""
     step = distance * STEP
     y = np.arange(-width / 2, width / 2, step[0])[:, None] + offset * step[0]
     z = FLOOR + np.arange(0, height, step[1])[None] + offset * step[1]

@@ -36,7 +36,7 @@ def draw_plainly(xyz, scales=(1.0,)):
     centre = points.mean(axis=0)
     _, vectors = np.linalg.eigh(np.cov((points - centre)[:, :2].T, bias=True))
     lateral = vectors[:, -1]
-    left = np.array([-centre[1], centre[0]])  # as seen from the sensor
+    left = np.array([-centre[1], centre[0]])  # left and right as seen from the sensor
     lateral = lateral if lateral @ left >= 0 else -lateral
     cluster = np.column_stack([(points - centre)[:, :2] @ lateral, points[:, 2] - centre[2]])
     augmented = np.concatenate([a * cluster for a in scales])  # contracted to the centroid
@@ -68,7 +68,7 @@ def rotate(xyz, angle, rng=None):
 
 
 def measure_radial_alignment(xyz):
-    """Return |cos| of the angle between the widest direction and the ray; at 1, "left" is undefined."""
+    """Return |cos| of the angle between the cluster's longest axis and the ray. At 1, left and right are undefined."""
     centre = xyz.mean(axis=0)[:2].astype(float)
     widest = np.linalg.eigh(np.cov(xyz[:, :2].T.astype(float)))[1][:, -1]
     return abs(widest @ centre) / np.linalg.norm(centre)
@@ -135,7 +135,7 @@ def test_similarity_is_symmetric_and_exactly_1_with_itself(seed):
     rng = np.random.default_rng(seed)
     images = np.stack([draw_silhouette(make_cluster(rng)) for _ in range(3)])
     table = np.stack([compute_similarity(images, image) for image in images])
-    assert (np.diag(table) == 1.0).all()  # so that a threshold of 1 still accepts the seed itself
+    assert (np.diag(table) == 1.0).all()  # so that the seed itself passes a threshold of 1
     np.testing.assert_array_equal(table, table.T)
     assert (table >= 0).all() and (table <= 1).all()
 
@@ -166,7 +166,7 @@ def test_moving_along_the_ray_keeps_the_silhouette(seed, factor):
 
 @given(seeds)
 def test_mirrored_cluster_has_the_mirrored_silhouette(seed):
-    # Left and right are exchanged. Pixels are half-open, so the images are not bit-equal.
+    # Left and right are swapped. Pixels are half-open intervals, so some pixels differ.
     xyz = make_cluster(np.random.default_rng(seed), 300)
     if measure_radial_alignment(xyz) < 0.999:
         mirrored = to_pixels(draw_silhouette(xyz * np.float32([1, -1, 1])))

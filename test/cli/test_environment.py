@@ -15,7 +15,7 @@ from samples import write_file
 from lidar_perception.nodes import NODES
 
 ROOT = Path(__file__).resolve().parents[2]
-BASE = "ros studio odometry"  # extras that every command has
+BASE = "ros studio odometry"  # extras that every command needs
 TEST = f"{BASE} test docs benchmark distributed onnx video"
 
 
@@ -50,7 +50,7 @@ def test_only_the_lidar_command_is_added_to_path():
 @needs_pip
 @pytest.mark.parametrize("name", ["tracker", "bag_recorder"])
 def test_executable_starts_the_node_of_its_name(name, tmp_path):
-    """Also in a folder with modules of the same names as those of the package."""
+    """The current folder contains modules with the names of the package's modules."""
     for module in "numpy", "signal", "lidar_perception":
         write_file(tmp_path / f"{module}.py", "raise SystemExit(3)")
     done = subprocess.run([INSTALLED / name, "--help"], cwd=tmp_path, capture_output=True, text=True)
@@ -72,7 +72,7 @@ def test_help_into_a_closed_pipe_ends_without_error():
 def test_concurrent_first_calls_create_one_environment(tmp_path):
     venv = tmp_path / "venv"
     write_file(venv / "bin/lidar-perception", "#!/bin/sh\necho ran $1\n").chmod(0o755)
-    with open(venv / "lidar-lock", "w") as lock:  # the lock of ./lidar
+    with open(venv / "lidar-lock", "w") as lock:  # lock file of ./lidar
         fcntl.flock(lock, fcntl.LOCK_EX)
         other = subprocess.Popen(
             [ROOT / "lidar", "info"],

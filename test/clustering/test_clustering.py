@@ -24,7 +24,7 @@ SCANS = DATA / "kitti_object/training/velodyne_reduced"
 
 
 def cluster_by_sklearn(xyz, eps, min_samples):
-    """Return scikit-learn's labels plus one, so that noise is 0. Both compute in float64."""
+    """Return scikit-learn's labels plus 1, so that noise is 0. Like our code, it computes in float64."""
     if len(xyz) == 0:
         return np.zeros(0, np.int32)
     model = DBSCAN(eps=eps, min_samples=min_samples, algorithm="kd_tree")
@@ -42,7 +42,7 @@ def to_partition(labels):
 
 
 def make_blobs(rng, centres, size, spread):
-    """Return points (N, 3) float32 around centres (K, 3), and the centre of each, 0..K-1."""
+    """Return points (N, 3) float32 around centres (K, 3), and the index of each point's centre."""
     centres = np.asarray(centres, float)
     xyz = np.repeat(centres, size, axis=0) + rng.uniform(-spread, spread, (size * len(centres), 3))
     return xyz.astype(np.float32), np.repeat(np.arange(len(centres)), size)
@@ -76,7 +76,7 @@ def test_labels_equal_sklearn_with_many_equal_distances(seed, count, reach, min_
 
 @pytest.mark.parametrize("min_samples", [2, 5, 6, 7, 27])
 def test_border_points_join_the_first_cluster(min_samples):
-    # Dense balls so close to each other that most border points are between two of them.
+    # Dense balls that are so close together that most border points belong to two of them.
     rng = np.random.default_rng(3)
     xyz, _ = make_blobs(rng, [[0, 0, 0], [0.9, 0, 0], [0, 0.9, 0], [0.9, 0.9, 0.2]], 40, 0.25)
     bridge = rng.uniform(-0.2, 1.1, (60, 3)).astype(np.float32)

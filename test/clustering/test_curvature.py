@@ -1,4 +1,4 @@
-"""Curvature-consistent growing equals plain NumPy and separates a bush from the wall it touches."""
+"""Growing by curvature equals a NumPy reference and separates a bush from the wall behind it."""
 
 from __future__ import annotations
 

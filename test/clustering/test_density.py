@@ -39,7 +39,7 @@ def scan():
 
 
 def make_scan(elevation_step, azimuth_step, rng):
-    """Return a scan with these steps in degrees, of surfaces 2 to 60 m away."""
+    """Return a scan of surfaces 2 to 60 m away, with the given angular steps in degrees."""
     elevation, azimuth = np.radians(
         np.meshgrid(np.arange(-25.0, 5.0, elevation_step), np.arange(-180, 180, azimuth_step))
     )
@@ -65,8 +65,7 @@ def test_density_matches_angular_resolution(elevation_step, azimuth_step):
     # Each beam has 1 / azimuth_step returns per degree of azimuth, at every elevation.
     slant = np.cos(np.radians(np.arange(-25.0, 5.0, elevation_step))).mean()
     expected = 1 / (elevation_step * azimuth_step * slant)
-    # Cells at the border of the view, or with every second beam, are only half filled, so the density is too
-    # low there.
+    # Cells at the border of the view, or between two beams, are half filled, which lowers the density.
     result = measure_density(make_scan(elevation_step, azimuth_step, np.random.default_rng(3)))
     assert result == pytest.approx(expected, rel=0.12, abs=0.3)
 

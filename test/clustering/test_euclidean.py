@@ -133,7 +133,7 @@ def test_labels_do_not_depend_on_the_frame(params):
     moved = (xyz.astype(float) @ turn.T + [30, -20, 1]).astype(np.float32)
     labels = cluster_euclidean(xyz, params)
     assert labels.max() >= 4
-    # The diameter for merging is axis-aligned, so it depends on the rotation; the clusters do not.
+    # Without merging, because its diameters are those of axis-aligned boxes and depend on the rotation.
     unmerged = replace(params, gamma=0.0)
     assert (cluster_euclidean(xyz, unmerged) == cluster_euclidean(moved, unmerged)).mean() > 0.999
     shifted = cluster_euclidean(xyz + np.float32([16, -32, 0]), params)
@@ -173,8 +173,8 @@ def test_gamma_merges_clusters_nearer_than_their_diameters():
 
 
 def test_local_threshold_adapts_to_the_density():
-    """Reason for Eq. 11 as the default: it finds both a wall with points 2 cm apart and one with points 0.4 m
-    apart, as on a distant car. A single threshold finds the dense wall only."""
+    """Eq. 11, the default, finds a wall with points 2 cm apart and one with points 0.4 m apart, as on a distant
+    car. A single threshold finds only the dense wall."""
 
     def wall(x, step):
         y, z = np.meshgrid(np.arange(0, 2.01, step), np.arange(0, 1.61, step))

@@ -1,4 +1,4 @@
-"""Bounded work for clouds that make exact methods compare all pairs."""
+"""Bounded work in clouds for which exact methods would compare all pairs of points."""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ REACH = 0.5
 
 
 def make_shell(n, gap, seed=0):
-    """Return half of the points at x = 15 m and half on a hemisphere around them, which is farther from the
-    sensor. The radius of the hemisphere is (1 + gap) * REACH.
-    """
+    """Return points, half of them at x = 15 m and half on a hemisphere of radius (1 + gap) * REACH behind them."""
     rng = np.random.default_rng(seed)
     normal = rng.normal(size=(n // 2, 3))
     normal[:, 0] = np.abs(normal[:, 0]) + 0.2

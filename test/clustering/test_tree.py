@@ -127,7 +127,7 @@ SETTINGS = [
 @pytest.mark.parametrize("params", SETTINGS, ids=range(4))
 @pytest.mark.parametrize("max_distances", [-1, 2000])
 def test_grid_and_tree_give_the_same_clusters(arrange, params, max_distances):
-    """With max_distances -1 only the tree is used. The plain implementation has no fixed threshold."""
+    """max_distances=-1 uses only the tree. The plain implementation does not support a fixed threshold."""
     xyz = make_points(arrange, 700)
     expected = cluster_euclidean(xyz, params, 10**9) if params.threshold == "fixed" else plain_euclidean(xyz, params)
     np.testing.assert_array_equal(cluster_euclidean(xyz, params, max_distances), expected)

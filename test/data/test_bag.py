@@ -184,7 +184,7 @@ def load_bytes(frames, i):
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_frames_can_be_loaded_in_any_order_thread_and_process(sample_bag, tmp_path, storage):
-    """Each thread opens the bag once, because reading a long index takes time."""
+    """Each thread opens the bag only once, because reading the index of a long bag takes time."""
     copy_bag(sample_bag, tmp_path / "bag", storage)
     frames = open_recording(tmp_path / "bag").frames
     expected = [frame.load().xyz.tobytes() for frame in frames]

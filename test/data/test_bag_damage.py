@@ -1,4 +1,4 @@
-"""Existing bags, damaged bags and other files: nothing is lost, and each problem is reported."""
+"""Existing and damaged bags: no data are lost, and each problem is reported."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def limit_file_size():
 
 @pytest.mark.no_cover
 def test_messages_written_before_the_disk_was_full_are_readable(tmp_path, monkeypatch, limit_file_size):
-    """The disk may be full in a chunk, in the index, or in metadata.yaml."""
+    """The disk becomes full while a chunk, the index or metadata.yaml is written."""
     monkeypatch.setattr(bag_module, "CHUNK_BYTES", 20_000)
     rng = np.random.default_rng(0)
     drive = [Frame.of(str(i), cloud_frame(rng.random((1000, 4), np.float32), STAMP + i)) for i in range(5)]

@@ -41,7 +41,7 @@ def test_class_names_are_recognised_in_any_spelling(text):
 
 
 def encode_for_windows(text):
-    """Encode a text like Windows editors, with trailing spaces."""
+    """Encode a text as Windows editors do, with trailing spaces."""
     return b"\xef\xbb\xbf" + text.replace("\n", " \t\r\n").encode() + b"\r\n\r\n"
 
 

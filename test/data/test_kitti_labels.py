@@ -1,4 +1,4 @@
-"""KITTI labels as text, boxes and markers are equivalent."""
+"""KITTI labels survive conversion between text, boxes and markers."""
 
 from __future__ import annotations
 

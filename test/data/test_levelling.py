@@ -1,4 +1,4 @@
-"""Conversion of clouds of a tilted sensor to a level frame, as nodes with its parameter file do."""
+"""Clouds of a tilted sensor are transformed to a level frame, as by a node with the sensor's parameter file."""
 
 import numpy as np
 import pytest

@@ -143,7 +143,7 @@ def test_global_transform_is_invertible(seed, yaw, pitch, roll):
     boxes = np.column_stack([rng.uniform(-50, 50, (5, 3)), rng.uniform(0.3, 9, (5, 3)), rng.uniform(-3.1, 3.1, 5)])
     moved = GlobalBoxes.of(*to_global_boxes(boxes, pose), 0)
     np.testing.assert_allclose(to_local_boxes(moved, pose), boxes, atol=1e-8)
-    # The box is transformed rigidly: its corners move as points do.
+    # The box moves rigidly: its corners are transformed like points.
     corners = box_corners(boxes)
     for box, centre, rotation, own in zip(boxes, moved.centres, moved.rotations, corners):
         signs = np.array([[x, y, z] for z in (-1, 1) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))]) / 2

@@ -22,7 +22,7 @@ COUNT = 5
 
 
 def make_clouds(full, whole=False):
-    """Yield clouds (50, 4) [x y z intensity] of a sensor with this scale; the first one is dark."""
+    """Yield clouds (50, 4) [x y z intensity] of a sensor with maximum intensity `full`; the first one is dark."""
     rng = np.random.default_rng(0)
     for i in range(COUNT):
         cloud = rng.uniform([3, -9, -1, 0], [30, 9, 1, 1], (50, 4))
@@ -113,7 +113,7 @@ def test_scale_does_not_depend_on_order_of_frames(tmp_path, layout, full, whole)
             assert scan.intensity.tobytes() == expected[i].tobytes()
             assert frames[i].intensity_max() == full
     assert np.array_equal(next(iter(open_recording(path))).load().intensity, expected[0])
-    if layout in ("bin_files", "pcd_files", "bag_files"):  # for convert --robot
+    if layout in ("bin_files", "pcd_files", "bag_files"):  # as `convert --robot` does
         assert np.array_equal(level_frame(frames[0], SensorMount()).load().intensity, expected[0])
         given = level_frame(frames[0], SensorMount(intensity_max=10.0)).load().intensity
         assert np.allclose(given, expected[0] * full / 10)

@@ -279,7 +279,7 @@ def test_stopped_run_is_resumed(drives, tmp_path, stand_in_calls):
         run_detector(stopped_run, partial(MadeDetector, fails=stop), [Json], ego="none", tracking=TrackingParams())
     assert len(stand_in_calls) == 3 and not (tmp_path / "parts/detections.json").exists()
     run_detector(stopped_run, MadeDetector, [Json], tracking=TrackingParams(), ego="none")
-    assert len(stand_in_calls) == len(recording)  # none of them twice
+    assert len(stand_in_calls) == len(recording)  # no frame was written twice
     assert read_json(tmp_path / "parts") == read_json(tmp_path / "whole")
 
 
@@ -315,7 +315,7 @@ def test_unreadable_frames_are_reported_and_skipped(kitti, tmp_path, monkeypatch
     scan_path, out = kitti / "training/velodyne/000001.bin", tmp_path / "out"
     content_bytes = scan_path.read_bytes()
     write_file(scan_path, b"123")
-    for _ in range(2):  # the failure is not remembered
+    for _ in range(2):  # an earlier failure has no effect
         assert detect(monkeypatch, kitti, "--out", out, "--format", ALL) == 1
         assert "000001.bin" in (output := capsys.readouterr().out) and "3 frames" in output
     assert len(stand_in_calls) == 3

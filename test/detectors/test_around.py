@@ -36,7 +36,7 @@ def open_shipped(version="v4", range="auto"):
 
 
 def compute_columns(scan):
-    """Return the experts' columns, which would differ slightly for a rotated cloud."""
+    """Return the ground and cluster columns of a cloud. For a rotated cloud they would differ slightly."""
     ground = segment_ground(scan, EXPERT_GROUND)
     return {"ground": ground, "cluster_ids": cluster_obstacles(scan.xyz, ground, EXPERT_CLUSTERING)}
 

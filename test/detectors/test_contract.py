@@ -1,4 +1,4 @@
-"""Every detector of the package fulfills the contract."""
+"""Every detector of the package meets the detector contract."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_ego_vehicle_is_dropped_for_any_heading(seed):
         is_dropped = points_in_box(np.zeros((1, 3)), extended_box)[0]
         if class_id == CAR and box[2] + box[5] / 2 < 0:
             if points_in_box(disc, extended_box).any() != points_in_box(1.02 * disc, extended_box).any():
-                continue  # too close to the limit to be decided by points
+                continue  # so close to the limit that rounding decides
             is_dropped = points_in_box(disc, extended_box).any()
         assert (tuple(box.astype(np.float32).tolist()) in remaining) != is_dropped
 

@@ -18,7 +18,7 @@ pytestmark = [
     pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here"),
 ]
 DETECTORS = [*sorted(POINTPILLARS_WEIGHTS.glob("*.safetensors")), "pointnet", "fused"]
-SURE = 0.3  # detections with at least this score exist on both devices
+SURE = 0.3  # detections with at least this score must exist on both devices
 
 
 @pytest.fixture(scope="module")
@@ -27,8 +27,8 @@ def scan(streets):
 
 
 def assert_alike(a: Detections, b: Detections, metres: float = 0.05, score: float = 0.03) -> None:
-    """Check that detections above SURE have a counterpart with similar position and score. CUDA convolutions use
-    TF32, with three significant digits.
+    """Assert that each detection above SURE has a counterpart with similar position and score. CUDA convolutions
+    use TF32, which has three significant digits.
     """
     assert (a.scores > SURE).sum() > 3
     for detections, other in ((a, b), (b, a)):

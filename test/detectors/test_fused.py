@@ -231,7 +231,7 @@ def test_fused_detector_meets_the_contract(detector):
     result = detector(scan)
     assert len(result.detections) > 3 and tuple(result.timings) == STEPS
     assert (np.diff(result.detections.scores) <= 0).all()
-    assert are_equal_detections(detector(scan), result)  # no state is left in the detector
+    assert are_equal_detections(detector(scan), result)  # the detector keeps no state
     sources = result.detections.sources
     assert set(sources) == set(KNOTS) and all(len(x) == len(result.detections) for x in sources.values())
     is_car = result.detections.class_ids == CAR
@@ -257,7 +257,7 @@ def test_sensor_height_and_given_columns_keep_the_result(detector):
     higher_detections = replace(
         higher_detections, boxes=higher_detections.boxes + np.array([0, 0, 0.5, 0, 0, 0, 0], np.float32)
     )
-    # Except boxes that count as the ego vehicle of one of the sensors.
+    # Boxes that count as the ego vehicle for one of the sensors are excluded.
     higher_detections, lower_detections = (
         drop_ego_vehicle(higher_detections, 1.73),
         drop_ego_vehicle(detections, 1.73 + 0.5),
@@ -343,7 +343,7 @@ def test_classifier_box_weight_interpolates_between_networks(detector):
 
 
 def test_hills_change_only_the_height_of_boxes():
-    """The networks get the points relative to flat ground."""
+    """The networks receive points whose ground has been flattened."""
     detector = load_fused_detector("", "cpu", EAGER).with_range("around")
     scan = (
         SimulatedScenes(11, 1, find_sensor("hdl64e", 0.0), Scenes(None, 3.0, "street"), all_around=True)

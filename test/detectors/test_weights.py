@@ -105,7 +105,7 @@ def test_matching_weights_of_another_network_are_copied(checkpoint):
     assert len(set(copy_matching_weights(network_with_ids, path, NetworkConfig))) == 1
     new_weight, stored_weight = (s["pillar_net.linear.weight"] for s in (network_with_ids.state_dict(), state))
     assert torch.equal(new_weight[:, :-1], stored_weight) and not new_weight[:, -1].any()
-    # a different neck starts with random weights
+    # a neck of another shape keeps its random weights
     different_network = make_network(make_tiny_config("v0"))
     initial_state = {name: value.clone() for name, value in different_network.state_dict().items()}
     copied, count = copy_matching_weights(different_network, path, NetworkConfig)
@@ -199,7 +199,7 @@ def test_error_for_missing_weights_explains_how_to_get_them(tmp_path, monkeypatc
 @needs_onnx
 @pytest.mark.no_cover
 def test_exported_network_gives_the_same_detections(tmp_path):
-    """v0 is exported by the function, v4 by the command. The other versions consist of parts of both."""
+    """v0 is exported by the function, v4 by the command. The other versions contain no other layers."""
     from lidar_perception.detectors.pointpillars.onnx import OnnxNetwork, export_onnx
 
     config = make_tiny_config("v0", anchors=make_tiny_config().anchors[:1], max_points=3, zero_row=True, middle_z=True)
@@ -306,7 +306,7 @@ def convert_to_project(state, project):
 
 @pytest.fixture(scope="module")
 def full_state():
-    """Return a v0 full network with ten inputs per point, as in those projects."""
+    """Return a full-size v0 network with ten inputs per point, as in other projects."""
     return make_random_network(make_config("v0", "full", middle_z=True)).state_dict()
 
 

@@ -59,7 +59,8 @@ def run(tmp_path, *arguments) -> tuple[dict, str]:
 
 
 def compute_report(root, *detectors) -> dict:
-    """Return the report of detectors; each is a function from a frame to a detector or None."""
+    """Return the report of detectors. Each one is given by a function that returns the detector for a frame, or
+    None."""
     contenders = [Contender(str(i), each) for i, each in enumerate(detectors)]
     report = ComparisonReport(contenders)
     fill_report(report, open_recording(root), partial(start_comparison, lambda: contenders))
@@ -67,7 +68,7 @@ def compute_report(root, *detectors) -> dict:
 
 
 def make_fake(detect):
-    """Return a function from a frame to a detector that returns detect(frame)."""
+    """Return a function that returns, for a frame, a detector whose result is detect(frame)."""
     return lambda frame: lambda scan: DetectionResult(detect(frame))
 
 

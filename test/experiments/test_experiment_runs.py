@@ -128,14 +128,14 @@ def test_killed_run_of_two_processes_resumes(crowd_recording, paper_run, tmp_pat
         time.sleep(0.005)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    wait_for_the_end(process.pid)  # its children end without a signal
+    wait_for_the_end(process.pid)  # its child processes end by themselves
     assert "Traceback" not in process.communicate()[1]
     kept = read_lines(out)
-    assert 4 <= len(kept)  # on a busy machine all may be measured before the signal comes
+    assert 4 <= len(kept)  # on a busy machine, all frames may be measured before the signal arrives
     run_reproduce("--data", crowd_recording, "--out", out, "--jobs", 1)
     assert read_untimed_records(out) == read_untimed_records(paper_run)
     assert read_untimed_files(out) == read_untimed_files(paper_run)
-    assert set(kept[:4]) <= set(read_lines(out))  # times are equal, so they were not measured again
+    assert set(kept[:4]) <= set(read_lines(out))  # equal durations: the frames were not measured again
 
 
 @pytest.mark.parametrize("cut", [1, 2, 40])

@@ -54,12 +54,12 @@ COUNTS = (
     *(f"{name} {what}" for name in CLASSES for what in ("points", "points of all", "density")),
 )
 EXTENTS = [f"{name} {what}" for name in CLASSES for what in ("height", "length", "width")]
-FACES = [name for name in CURVES if name.startswith("Car from")]  # no car in these scenes shows only one face
+FACES = [name for name in CURVES if name.startswith("Car from")]  # in these scenes each car shows more than one side
 LIGHT = [name for name in CURVES if "intensity" in name]
 
 
 def make_scan(seed: int, points: int = 500) -> Frame:
-    """Return a street all around with objects that are filled with points."""
+    """Return a scan of a street, all around the sensor, with objects that are filled with points."""
     rng = np.random.default_rng(seed)
     reach, turn = rng.uniform(3, 70, 12000), rng.uniform(-np.pi, np.pi, 12000)
     reach[:3000] = rng.uniform(3, 9, 3000)  # dense enough for every ground cell
@@ -89,7 +89,7 @@ def compute_rows(frame: Frame) -> dict:
 
 
 def change_scans(change, count: int = SCANS) -> list[Frame]:
-    """Return the street's scans after a change of every frame."""
+    """Return the scans of the street with a change applied to every frame."""
     return [
         replace_scan(r, change(r.load(), np.random.default_rng(100 + i)))
         for i, r in enumerate(map(make_scan, range(count)))
@@ -219,7 +219,7 @@ def test_objects_at_the_image_border_are_excluded():
     border = one.truth().boxes[:1].copy()
     while one.camera().in_view(border[:, :3]).all():
         border[0, 1] += 0.1
-    border[0, 1] -= 0.2  # the centre is in view, half of the box is not
+    border[0, 1] -= 0.2  # the centre is in view, but half of the box is not
     assert compute_object_rows(one.load(), GroundTruth.of(border, [0]), one.camera()) == {}
 
 

@@ -193,8 +193,7 @@ def test_readings_and_detector_count_the_same_pedestrians(paper_records):
 
 
 def test_search_at_paper_setting_equals_stage_1(refined_frames, paper_records):
-    """Only ranges without boxes or pedestrians near their limits are compared, because clusters are split
-    there."""
+    """Only ranges without objects near their limits are compared, because clusters are split at range limits."""
     compared = 0
     for (labelled, _, _, found), record in zip(refined_frames, paper_records):
         boxes, truth = found.stage1.boxes, labelled.pedestrians

@@ -1,4 +1,4 @@
-"""Fuzzing: mutated messages, parameters and files against the package.
+"""Fuzzing of the package with mutated messages, parameters and files.
 
 A case is given by its part, seed and number. It survives (there is a result), is refused with a
 reason, or fails. test_fuzz.py runs a few cases of every part; for long runs, in the folder test:

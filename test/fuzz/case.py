@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 SURVIVED, REFUSED, FAILED = "survived", "refused", "failed"
-CASE_SECONDS = 300.0  # time limit of a case; then the process ends and prints all stacks
+CASE_SECONDS = 300.0  # time limit of a case in seconds; after it, the process prints all stacks and ends
 
 
 class Case(NamedTuple):
-    """One input: its name, and the settings that its part needs to generate it."""
+    """One input: its name, and the settings from which it is generated."""
 
     name: str
     settings: tuple[Any, ...] = ()

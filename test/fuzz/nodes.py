@@ -122,7 +122,7 @@ class FedNode:
         self.inputs = INPUTS[name][1]
         self.calls = {s.topic_name.removeprefix(f"/{name}").lstrip("/"): s.callback for s in self.node.subscriptions}
         for made in self.node.inputs.items:
-            if isinstance(made, Reception):  # without its queue
+            if isinstance(made, Reception):  # delivers immediately, without the input queue
                 self.calls[made.topic.removeprefix(f"/{name}").lstrip("/")] = made.deliver
         self.params: dict[str, Any] = {}
         self.sent: list[tuple[Any, bytes]] = []
@@ -165,8 +165,7 @@ class FedNode:
         ]
 
     def judge(self, states: list[tuple[bytes, str]]) -> Outcome:
-        """Fail on a bug, on unreadable output, or if the last of several messages, which is valid, was
-        rejected."""
+        """Return a failure after an exception or unreadable output, or if the valid last message was rejected."""
         problem = next((message for _, message in states if BUG in message), None)
         if problem is None and len(states) > 1 and states[-1][0] == ERROR:
             problem = f"a valid message was refused: {states[-1][1]}"

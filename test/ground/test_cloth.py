@@ -37,7 +37,7 @@ def compute_free_height(sheet, obstacle, lift):
 
 
 def settle_slowly(obstacle, lift, steps=20_000):
-    """Settle the sheet from below by projected Jacobi steps in float64."""
+    """Settle the cloth from below by projected Jacobi steps in float64."""
     sheet = np.full(obstacle.shape, obstacle.min(), np.float64)
     for _ in range(steps):
         sheet = np.minimum(compute_free_height(sheet, obstacle, lift), obstacle)

@@ -17,7 +17,7 @@ def make_cloud(rng, count):
 
 
 def compute_heights_slowly(xyz, ground):
-    """Yield each point's height above every one of the equally near cells, point by point."""
+    """Yield, for each point, its heights above all nearest cells, if several are equally near."""
     cells: dict[tuple, list] = {}
     for x, y, z in ground.astype(float):
         cells.setdefault((np.floor(x / CELL_M), np.floor(y / CELL_M)), []).append(z)

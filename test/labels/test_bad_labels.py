@@ -208,7 +208,7 @@ def test_fields_of_other_tools_are_kept_or_rejected(key, format, tmp_path):
 
 
 def test_huge_integers_survive_every_format(tmp_path):
-    """The integers are in extra fields, which are only copied."""
+    """The integers are in extra fields, which are copied unchanged."""
     frames = make_format_drive("one")
     path = write_labels(tmp_path / "in", "labelcloud", '"name"', f'"n": {10**400}, "name"')
     labels = import_labels(path, "labelcloud", frames)

@@ -58,7 +58,7 @@ def test_labelcloud_rotation_is_counterclockwise_from_x(format, degrees, tmp_pat
     (item,) = content["objects"]
     turn = item["rotations"]["z"]
     assert turn == pytest.approx(math.degrees(2.0) if degrees else 2.0)
-    assert list(item["rotations"]) == ["x", "y", "z"]  # labelCloud relies on this order
+    assert list(item["rotations"]) == ["x", "y", "z"]  # labelCloud expects this order
     assert list(item["dimensions"].values()) == [4.0, 1.8, 1.5]
     backwards = {**item["rotations"], "z": 350.0 if degrees else -0.3}
     (tmp_path / "l/000005.json").write_text(json.dumps({**content, "objects": [{**item, "rotations": backwards}]}))
@@ -275,8 +275,8 @@ def test_one_part_of_a_split_track_keeps_its_name(format, key, tmp_path):
     assert [e.get(key) for e in after.extra if e] == [name]
 
 
-# Axes of coordinate systems as columns in the LiDAR's, and the sizes along them of a box 4 x 1.8 x
-# 1.5, which is rotated about the vertical axis.
+# Axes of coordinate systems, as columns in the LiDAR frame, and the sizes along these axes of a 4 x 1.8 x 1.5 m box
+# that is rotated about the vertical axis.
 AXES = {
     "camera": (((0, 0, 1), (-1, 0, 0), (0, -1, 0)), (4.0, 1.5, 1.8)),
     "y up": (((0, 0, -1), (-1, 0, 0), (0, 1, 0)), (4.0, 1.5, 1.8)),

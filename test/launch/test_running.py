@@ -1,6 +1,6 @@
 """Every launch file with its nodes: results are published, the bag is scored, and all nodes exit with 0.
 
-Where launch_ros is installed, `ros2 launch` runs the files; elsewhere launch_stand_in.py does.
+`ros2 launch` runs the files if launch_ros is installed, otherwise launch_stand_in.py.
 """
 
 from __future__ import annotations

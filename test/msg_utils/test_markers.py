@@ -1,4 +1,4 @@
-"""Conversion of boxes to markers and detections and back, and successive arrays."""
+"""Conversion of boxes to markers and detections and back, also in successive arrays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motion correction: inverse, comparison with a plain loop, and bounded work."""
+"""Motion correction inverts skew, equals a plain loop, and looks up few poses."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ import pytest
 
 @pytest.fixture(scope="session")
 def domain(domain) -> int:
-    """Fork nodes from a process without coverage, because in-process nodes cover nearly all lines."""
+    """Fork nodes from a process without coverage; nodes in the test process cover nearly all lines."""
     from lidar_perception.testing import forking  # noqa: F401  sets what that process loads
 
     with pytest.MonkeyPatch.context() as patch:

@@ -146,7 +146,7 @@ def test_clustering_and_refinement_name_the_missing_column(send, peer, good_clou
 
 
 def test_diagnostics_report_missing_camera_and_seed(send, peer, good_cloud, drive_bag):
-    """First view.enabled without CameraInfo, then no seed, then a clicked pedestrian."""
+    """The cases are: view.enabled without CameraInfo, no seed, and a clicked pedestrian."""
 
     def is_reported(words):
         send("perception", good_cloud, lambda: words in peer.get_message("perception"), words)

@@ -1,4 +1,4 @@
-"""A cloud that is to be cropped waits for its camera."""
+"""A cloud that is cropped to the image waits for its CameraInfo."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ FRAMES = 4  # enough to confirm tracks
 
 
 def test_demo_scores_like_offline_in_one_or_many_processes(drive_bag, make_bag, tmp_path):
-    """Tracks are equal in every bit."""
+    """Tracks are bit-identical."""
     bag = make_bag(open_recording(drive_bag).frames[:FRAMES])
     frames = {frame.stamp_ns: frame for frame in open_recording(bag)}
     torch.set_num_threads(len(os.sched_getaffinity(0)))  # sums depend on the number of threads; nodes use all cores

@@ -36,7 +36,7 @@ def compute_base_pose(at_ns):
 
 @pytest.mark.parametrize("source", ["odometry", "tf"])
 def test_cloud_of_moving_sensor_is_compensated(start_node, source):
-    """Later nodes get the compensated points; those on the robot's body do not move. Without odometry the cloud
+    """Subsequent nodes get the compensated points. Points on the robot's body are not moved. Without odometry the cloud
     is used uncompensated, with a warning."""
     rng = np.random.default_rng(0)
     sensor = mount_pose(1.2, 0.1, 1.8, 0.5, 0.0, 0.0)

@@ -189,7 +189,7 @@ def test_late_poses_delay_frames_by_max_wait_once(start_node, monkeypatch):
     ego, wait = node.tracks.ego, node.params.ego.max_wait
     ego.node.transforms.on_odometry(make_base_odometry(compute_base_pose(0), START, "lidar"))
     held = []
-    for i in range(1, 9):  # up to half a second after the last pose, so that they are late
+    for i in range(1, 9):  # up to half a second after the last pose, so the poses are late
         held.append(ego.find_missing_pose(make_cloud_header(START + i * TENTH // 2)) is not None)
         now[0] += 0.06
     assert held == [0.06 * i < wait for i in range(8)] and not all(held)
@@ -214,13 +214,13 @@ def test_stopped_or_foreign_clock_odometry_is_reported(start_node, monkeypatch):
     assert "1000 s ahead of the detections" in report(0) and "same clock" in node.diagnostics.state[1]
     node.transforms.on_odometry(make_base_odometry(compute_base_pose(0), START, "lidar"))
     now[0] += 5.0
-    report(2)  # the tracker continues at first
+    report(2)  # at first the tracker still publishes
     assert "no odometry on /tracker/input/odometry for 5 s" in report(2.1)
 
 
 @pytest.mark.parametrize("source, lag", [("odometry", 3.0), ("tf", 0.7)])
 def test_pose_source_that_is_always_late_is_reported(start_node, source, lag):
-    """The lag is longer than ego.max_gap and too short for a different clock."""
+    """The lag is longer than ego.max_gap, but too short to indicate another clock."""
     node = start_node(TrackerNode, **{"ego.source": source})
     for i in range(15):
         stamp = START + i * TENTH

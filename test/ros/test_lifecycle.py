@@ -145,7 +145,7 @@ def test_manager_drives_a_detector_through_all_states(nodes, peer, weights):
         assert find_received(found, round_) is None
     change_states(peer, node, "cleanup", "configure", "activate")
     peer.send(talker, make_scan_message(31), lambda: find_received(found, 31), "detections")
-    assert not change_state(peer, node, "configure")  # rclpy alone would end the node
+    assert not change_state(peer, node, "configure")  # without the package's handler, rclpy would end the node
     change_states(peer, node, "deactivate", "cleanup", "unconfigured_shutdown")
     process = f"ready.{NODE}"
     assert not nodes.has_ended(process) and nodes.end(process) == 0
@@ -204,7 +204,7 @@ def test_simulated_clock_works_after_cleanup(make_local_node, peer):
 
 
 def test_node_waits_for_missing_network_file(nodes, peer, late_weights, weights):
-    """Configuring fails until the file exists; an autostarted node loads it then."""
+    """Configuring fails until the file exists. A node with autostart then loads it by itself."""
     reason = f"checkpoint not found: {late_weights}"
     driven, alone = f"waits/{NODE}", f"tries/{NODE}"
     for _ in range(2):
@@ -251,7 +251,7 @@ def test_failed_activation_is_reported_and_retried(make_local_node, peer, monkey
 
 
 def test_waiting_clouds_are_dropped_without_counting_pause(make_local_node, peer, good_cloud):
-    """sent = frames + dropped + lost holds for clouds that are sent while the node is active."""
+    """For clouds sent while the node is active, sent = frames + dropped + lost."""
     node = make_local_node(GroundSegmentation, {"input.queue": 3}, {"~/input/points": "/in"})
     talker = peer.advertise("/in", CLOUD)
     peer.send(talker, good_cloud, lambda: node.diagnostics.counts["frames"], "a frame")

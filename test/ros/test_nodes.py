@@ -159,7 +159,7 @@ for given in sys.argv[1:]:
 
 
 def test_unknown_parameter_is_reported(start_node):
-    """The message of rclpy would be: undeclared parameter(s): []."""
+    """rclpy itself would report: undeclared parameter(s): []."""
     node = start_node(GroundSegmentation)
     for name, words in (
         ("input.queu", "no parameter 'input.queu'; did you mean 'input.queue'?"),
@@ -187,7 +187,8 @@ def test_missing_template_is_reported_with_first_cloud(perception, shared_peer, 
 
 
 def test_unused_inputs_change_nothing(perception, shared_peer, talker, good_cloud):
-    """A click while seed.source is file, and a CameraInfo without P while view is disabled."""
+    """The unused inputs are a click while seed.source is `file`, and a CameraInfo without P while the view is
+    disabled."""
     peer, found = shared_peer, shared_peer.listen("/perception/output/detections", MARKERS)
     peer.send(talker, good_cloud, lambda: found, "candidates")
     first = from_marker_array(found[-1])

@@ -182,7 +182,7 @@ def test_topic_of_several_publishers_offers_the_strictest_qos():
 
 def test_pause_step_resume_and_rate_take_effect(processes, peer, text_bag):
     heard = peer.listen("/text", TEXT)
-    start(processes, text_bag, start_paused=True, rate=0.02)  # the rest takes 85 s
+    start(processes, text_bag, start_paused=True, rate=0.02)  # the remaining messages would take 85 s
     request = Trigger.Request()
     for expected in (["0"], ["0", "1"], ["0", "1", "2"]):
         assert peer.call("/bag_player/step", Trigger, request).success
@@ -237,7 +237,7 @@ def test_clock_follows_a_looped_bag(processes, peer, text_bag):
     start(processes, text_bag, loop=True, rate=3.0, clock_hz=200.0)
     peer.wait(lambda: len(heard) > 45, "two and a half rounds")
     numbers = np.array(get_texts(heard), int)
-    again = np.flatnonzero(np.diff(numbers) < 0)  # also a busy subscriber notices every round
+    again = np.flatnonzero(np.diff(numbers) < 0)  # so that even a busy subscriber notices every round
     assert 2 <= len(again) <= 3 and (np.diff(numbers) != 0).all()
     assert (numbers[again] > 14).all() and (numbers[again + 1] < 5).all()
     times = np.array([to_ns(c.clock) for c in clock])
@@ -353,7 +353,7 @@ def test_looped_bag_of_one_message_does_not_busy_loop(monkeypatch, tmp_path):
 
     def play():
         player.now_ns, player.last_advance = START, now[0]
-        for late in range(200):  # like a rate that is too high
+        for late in range(200):  # a rate that is too high has the same effect
             if not player._wait_until(START - late, "/text"):
                 return
             sent.append(now[0])

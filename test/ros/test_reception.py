@@ -38,7 +38,7 @@ TEXT = "std_msgs/msg/String"
 
 @contextmanager
 def start_driver(peer, reliability, count, points=KITTI, first=1, hz=10):
-    """Run a process that publishes clouds, without a Fast DDS profile."""
+    """Start a process that publishes clouds, without a Fast DDS profile."""
     environment = {k: v for k, v in os.environ.items() if k not in PROFILE_VARIABLES}
     process = subprocess.Popen(
         [
@@ -75,7 +75,7 @@ def test_clouds_are_received_with_any_reliability(processes, peer):
     def done():
         return value("frames") + value("dropped")
 
-    for name in PROFILE_VARIABLES:  # the node chooses its profile, as one started by a user
+    for name in PROFILE_VARIABLES:  # the node chooses its profile, as if a user had started it
         processes.environment.pop(name, None)
     processes.start(
         NODE, {"~/input/points": "/in"}, {"input.error_after": 1, "input.stale_after": 3, "input.max_lost": 0}
@@ -180,7 +180,7 @@ def make_infos(numbers, period=10**8):
 
 
 def test_every_cloud_is_processed_or_counted_as_dropped():
-    """sent = received + dropped + lost, in any mixture of losses and full queues."""
+    """sent = received + dropped + lost, for any combination of losses and full queues."""
     rng = np.random.default_rng(0)
     for _ in range(100):
         arrivals, taken, number, sizes = Arrivals(5), 0, 0, []

@@ -30,7 +30,7 @@ def test_recorder_stores_latched_messages_of_every_publisher(processes, peer, tm
 
 
 def test_late_publisher_with_weaker_qos_is_recorded(processes, peer, tmp_path):
-    """Also if the topic is in the node's namespace."""
+    """The topic may also be in the namespace of the node."""
     first = peer.advertise("/robot/text", TEXT, RELIABLE)
     processes.start("bag_recorder", {}, {"bag": str(tmp_path / "bag"), "topics": ["text"]}, namespace="robot")
 
@@ -66,7 +66,7 @@ def test_recording_continues_if_a_type_is_not_installed(monkeypatch, peer, start
 
 
 def test_slow_recorder_drops_and_reports_messages(monkeypatch, start_node, tmp_path):
-    """Also while simulated time does not advance."""
+    """This also holds while simulated time stands still."""
     from lidar_perception.nodes.replay import bag_recorder
 
     monkeypatch.setattr(bag_recorder, "MAX_QUEUED_BYTES", 100)

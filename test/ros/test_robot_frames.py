@@ -55,7 +55,7 @@ TILTS = {
 
 @pytest.mark.parametrize("tilt", TILTS)
 def test_candidates_of_tilted_and_level_sensor_are_equal(start_node, tilt):
-    """The candidates are in the base frame, and the click in a third frame; TF has all mounts."""
+    """The candidates are in the base frame, the click in a third frame. TF contains the poses of all mounts."""
     found = []
     x, y, height, yaw, *_ = TILTS[tilt]
     for base in (mount_pose(x, y, height, yaw, 0.0, 0.0), mount_pose(*TILTS[tilt])):
@@ -230,7 +230,7 @@ def test_missing_frames_are_reported_and_parameters_used(start_node):
 
 
 def test_body_crop_needs_a_known_frame(start_node):
-    """With an unknown frame it could remove people. A body below the ground is reported."""
+    """Cropping in an unknown frame could remove people. A body below the ground is reported."""
     node = start_node(GroundSegmentation, base_frame="base", **{"crop.body": [-0.5, -0.4, 0.2, 0.5, 0.4, 1.0]})
     floor = np.random.default_rng(0).uniform(-20, 20, (2000, 3)) * [1, 1, 0]
     sensor = mount_pose(0.5, 0.0, 1.2, 0.0, 0.0, 0.0)  # the base's origin is behind it
@@ -263,7 +263,7 @@ def test_unreadable_template_affects_candidates_only(start_node):
 
 
 def test_cloud_waits_for_late_or_missing_transform(start_node):
-    """It waits neither for a transform that has stopped nor without TF."""
+    """It does not wait if a transform has stopped or if there is no TF."""
     xyz, _ = make_walker(mount_pose(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
     node = start_node(Perception, target_frame="odom")
     deliver, msg = node.inputs.receptions[0].deliver, encode(make_robot_cloud(xyz))

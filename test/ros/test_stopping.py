@@ -40,8 +40,7 @@ sys.exit(_run_nodes([(Refused, ["node"], {})], ["node"], 0.0, stop))
 """
 
 
-# By case: program, signal, exit code and output. The signals are equivalent
-# (STOP_SIGNALS), so each case has one.
+# Each case: rest of the program, signal, exit code and output. All STOP_SIGNALS are equivalent, so each case has one.
 CASES = {
     "work": (WORK_HANGS, signal.SIGINT, 0, ""),
     "teardown": (TEARDOWN_HANGS, signal.SIGTERM, 3, ""),

@@ -210,7 +210,7 @@ def test_result_files_have_the_detections(tmp_path):
 
 
 def test_result_files_keep_the_order_of_weak_scores(tmp_path):
-    """Average precision depends on many boxes just above the lowest score."""
+    """Many boxes have scores just above the minimum, and average precision depends on their order."""
     scores = np.float32(0.001 + 3e-6 * np.arange(100))
     write_results(
         tmp_path / "a.txt", Detections.of(np.tile([20.0, 0, -1, 4, 2, 1.5, 0], (100, 1)), 0, scores), CALIBRATION
@@ -343,8 +343,8 @@ def test_real_labels_as_results_score_100(data, tmp_path):
 
 @pytest.mark.no_cover
 def test_real_boxes_project_onto_their_2d_labels(data, detector, tmp_path):
-    """Boxes score 100 in BEV and 3D. In the image, limbs and occlusion make a person's label differ from the
-    projected box."""
+    """Boxes score 100 in BEV and 3D. In the image, the label of a person may differ from the projected box because
+    of limbs and occlusion."""
     truths = iter([f.truth() for f in open_recording(data / "kitti_object")])
 
     def find(frame):

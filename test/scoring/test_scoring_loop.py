@@ -1,4 +1,4 @@
-"""The scoring loop: results are equal and ordered in one process, in many, and on Dask."""
+"""The scoring loop gives equal results in the same order in one process, in many, and on Dask."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ def test_robot_body_is_found_and_cropped():
     behind = [(a, b) for ring, a, b in c.blocked if ring == 0]
     assert any(a <= 168 and b >= 192 for a, b in behind)
     assert len(measure(change_scans(None)).view.coverage.box) == 0
-    # robot.param.yaml also has the box in base_frame, from TF or the ground.
+    # robot.param.yaml also contains the box in base_frame, with a base from TF or on the ground.
     xyz, mount = m.source.scans[0].xyz, m.mounting.mount
     own = xyz[np.hypot(*xyz[:, :2].T) < 1.0]
     by_tf = m.mounting.recorded._replace(footprint=make_tilted_pose(0.1, -0.2, 0.9))

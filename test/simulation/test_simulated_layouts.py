@@ -124,7 +124,7 @@ def test_semantickitti_layout_is_read_as_written(simulated_data_sets):
         to_camera = np.vstack([np.fromstring(calibration["Tr"], sep=" ").reshape(3, 4), [0, 0, 0, 1]])
         poses = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
         assert np.loadtxt(folder / "times.txt").tolist() == [0.0, 0.1]
-        for moment, pose in enumerate(poses):  # like SemanticKITTI's tools
+        for moment, pose in enumerate(poses):  # as SemanticKITTI's tools do
             pose = np.linalg.inv(to_camera) @ np.vstack([pose, [0, 0, 0, 1]]) @ to_camera
             assert np.allclose(pose, simulate_scan(3 + sequence, moment, TINY).pose, atol=1e-9)
 

@@ -75,8 +75,8 @@ def test_points_of_object_are_in_its_box(seed, t):
     semantic = make_returns(hits, COARSE, NO_MOTION, np.random.default_rng(0)).semantic
     for box, track, speed, kind in zip(state.boxes, state.track_ids, state.speeds, state.class_ids):
         on_object = (owner == track) & (semantic != 99)  # 99: carried objects
-        # Hits at the edge of a beam are reported at its centre. Boxes are those at the stamp, up to half a
-        # sweep from some points. Mirrors and umbrellas stick out.
+        # Hits at the edge of a beam are reported at its centre. Boxes are those at the stamp, while some points are
+        # measured up to half a sweep later. Mirrors and umbrellas extend beyond the box.
         beam = (np.linalg.norm(box[:3]) + 10) * COARSE.divergence / 2 + 6 * COARSE.range_noise
         margin = beam + speed / COARSE.rate / 2 + (0.6 if kind == PEDESTRIAN else 0.2)
         assert points_in_box(xyz[on_object], box, margin=margin).all()

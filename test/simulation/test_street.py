@@ -28,7 +28,7 @@ make_cached_scene = cache(lambda kind, seed, people=1.0: make_scene(seed, kind, 
 
 @pytest.mark.parametrize("kind, seed", STREETS)
 def test_actors_never_overlap(kind, seed):
-    """Includes labelled and unlabelled objects and the ego vehicle, except people on benches and plants."""
+    """All objects are compared, including unlabelled ones and the ego vehicle, except people on benches and plants."""
     scene = make_cached_scene(kind, seed)
     props = [a for a in scene.actors if not a.obj.label]
     plants = np.array([is_plant(a) for a in props])

@@ -1,4 +1,4 @@
-"""The modules of the page's sources: imports in one direction, bundle with their texts."""
+"""The modules of the page import each other in one direction, and the bundle is up to date."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Saving in the page: typed numbers, fast keys, late states."""
+"""The page saves typed numbers and fast key presses, and handles late server states."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_typed_number_changes_one_value_unless_cancelled(page, labels, person):
         page.keyboard.press(key)
         labels.wait(page, number, lambda t, y=there[1]: get_boxes(t)[0][1] == y)
         page.wait_for_function("y => document.getElementById('field-y').value === y", arg=f"{there[1]:.2f}")
-    page.click("#errors .toast button")  # the refusal was reported
+    page.click("#errors .toast button")  # the rejection was reported
     assert labels.box(number) == [before[0], 4.567, *before[2:]]
     assert len(labels.lines()) == lines + 1
     page.focus("#field-x")

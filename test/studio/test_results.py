@@ -1,4 +1,4 @@
-"""Results in view: missed and false boxes, results in bags."""
+"""Results in `view`: missed and false boxes, and results in bags."""
 
 from __future__ import annotations
 

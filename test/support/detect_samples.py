@@ -26,8 +26,8 @@ class MadeParams(Params):
 
 
 class MadeDetector:
-    """Detector that finds a walker, and a car with a low score that differs between clouds. calls: all clouds
-    that were given to any instance; fails(scan): called before each detection."""
+    """Detector that finds a walker, and a car with a low score that differs between clouds. calls: clouds passed to
+    any instance; fails(scan): called before each detection, may raise."""
 
     classes = ("Car", "Pedestrian")
     calls: list = []

@@ -108,7 +108,7 @@ def role_of_truth(o, kind, level):
 
 
 def role_of_detection(d, kind, level):
-    """Return 'judge', 'may be used' (any class, below the minimum height) or None."""
+    """Return 'judge', 'may be used' (for detections of any class below the minimum height) or None."""
     if d["bottom"] - d["top"] < LIMITS[level][0]:
         return "may be used"
     return "judge" if d["kind"] == kind else None

@@ -118,7 +118,7 @@ class Label:
         return page.evaluate("page.store.selected")
 
     def add_track(self, page, person: np.ndarray) -> int:
-        """Create and select a new track of a person; decisions do not move on to the next track."""
+        """Create and select a new track of a person. After a decision the selection stays on the track."""
         number = self.seed(page, person)
         page.uncheck("#advance")
         page.locator("#scene").focus()

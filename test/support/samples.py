@@ -148,7 +148,7 @@ def make_upright(rng, x: float, y: float, height: float, width: float) -> np.nda
 
 def make_crowd(seed: int, people: int = 4) -> tuple[np.ndarray, GroundTruth]:
     """Return a cloud (N, 4) float32 and labels: people, posts, boxes and a labelled car without points on flat
-    ground 1.7 m below, 6 to 40 m away, none of them across 15 or 30 m."""
+    ground 1.7 m below, 6 to 40 m away. No object crosses the range limits 15 and 30 m."""
     rng = np.random.default_rng(seed)
     parts = [rng.uniform([2, -20, -1.7], [50, 20, -1.69], (4000, 3))]
     boxes, ids = [], []

@@ -67,7 +67,7 @@ def test_every_type_of_detections_gives_the_same_message(make):
 
 @pytest.mark.parametrize("limit", [{"max_distance": 0.5}, {"min_iou": 0.3}])
 def test_order_does_not_matter_and_missing_detection_is_named(limit):
-    """Objects that are missing in one direction are extra in the other."""
+    """An object that is missing in one direction is unexpected in the other."""
     rng = np.random.default_rng(1)
     for _ in range(30):
         expected = draw_objects(rng, int(rng.integers(1, 20)))

@@ -138,7 +138,7 @@ def test_cluster_and_point_scores_agree_with_hand_count(rng):
     scores = ClusterScores(CONFIG.classes)
     clusters = make_blobs(rng, [20, 20, 12, 12, 9])
     found = np.eye(4, dtype=np.float32)[[0, 3, 1, 2, 0]]
-    labels = np.array([0, 0, 1, 3, 0])  # correct, missed, correct, wrong; too small to count
+    labels = np.array([0, 0, 1, 3, 0])  # correct, missed, correct, wrong, and too small to count
     numbers = np.array([1, 1, 2, 3, 0, 0])
     truth = np.array([0, 3, 0, 1, 1, UNKNOWN])
     scores.update(
@@ -339,7 +339,7 @@ def test_only_background_gets_high_intensity(rng):
         sample = ClusterPreparation(CONFIG, replace(STILL, things_shine=shine))(scene, rng)
         bright = (sample.inputs.points[..., 3] > 0.9).any(axis=1)
         assert not bright[sample.has_box].any()
-        # not all, as there may be no point between the heights
+        # not all clusters, because some have no point between the heights
         assert bright[~sample.has_box].mean() >= 0.7 * shine
         assert shine or not bright.any()
     assert np.array_equal(scene.clusters.points, before)

@@ -38,7 +38,7 @@ def test_broken_scenes_are_skipped_reported_and_counted(tmp_path, capsys):
     assert len(batches.skipped) == 2
     reasons = sorted(batches.skipped)
     assert "000001.txt:1" in reasons[0] and "000003.bin" in reasons[1]
-    assert capsys.readouterr().err.replace("\n", "").count("skipped:") == 2  # each one is printed once
+    assert capsys.readouterr().err.replace("\n", "").count("skipped:") == 2  # each problem is printed once
     broken = Stream((RecordedScenes(root, ("000001", "000003")),), prepare_all)
     with pytest.raises(InputError, match="no usable scene among 2"):
         broken[0]

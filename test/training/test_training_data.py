@@ -108,7 +108,7 @@ def take_batches(batches: Batches, first: int, steps: int) -> list:
 def test_stream_depends_only_on_seed():
     stream = Stream((Numbers(0, 7), Numbers(100, 4)), prepare_all, 5)
     whole = take_batches(Batches(stream, 3), 0, 12)
-    assert take_batches(Batches(stream, 3), 5, 7) == whole[5:]  # like after an interruption
+    assert take_batches(Batches(stream, 3), 5, 7) == whole[5:]  # as after an interruption
     assert take_batches(Batches(stream, 3, jobs=2), 0, 6) == whole[:6]
     pair = [take_batches(Batches(stream, 3, rank=rank, world_size=2), 0, 6) for rank in (0, 1)]
     assert [batch for both in zip(*pair) for batch in both] == whole
@@ -273,7 +273,7 @@ class Large:
 def test_training_ends_with_reason_if_worker_is_killed(jobs):
     batches = load_items(Large(), ([n] for n in range(10**6)), jobs)
     pid = next(batches)[0][0]
-    time.sleep(0.2)  # it is sending the next item
+    time.sleep(0.2)  # the process is sending its next item
     os.kill(pid, signal.SIGKILL)
     with pytest.raises(InputError, match=r"prepared scenes.*code -9.*try fewer --jobs"):
         for _ in range(20):
