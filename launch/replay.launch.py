@@ -25,6 +25,7 @@ from launch_ros.actions import Node
 
 from launch import LaunchDescription
 from lidar_perception.data.bag import Bag
+from lidar_perception.data.bag_frames import choose_cloud_topic
 from lidar_perception.nodes.graph import (
     FINAL_STAGE,
     configure_evaluator,
@@ -32,12 +33,7 @@ from lidar_perception.nodes.graph import (
     list_result_topics,
     make_relative,
 )
-from lidar_perception.nodes.launch_parameters import (
-    add_arguments,
-    choose_cloud_topic,
-    list_parameter_files,
-    split_detectors,
-)
+from lidar_perception.nodes.launch_parameters import add_arguments, list_parameter_files, split_detectors
 from lidar_perception.nodes.launching import ARGUMENTS as GRAPH_ARGUMENTS
 from lidar_perception.nodes.launching import find_argument_names, reject_unknown_arguments
 from lidar_perception.nodes.shared_memory import use_large_shared_memory
@@ -64,8 +60,7 @@ ARGUMENTS = {
     ),
     **{k: options for k, options in GRAPH_ARGUMENTS.items() if k not in FIXED_ARGUMENTS},
     "points": dict(
-        default_value="",
-        description="Topic of the clouds in the bag; may be empty if the bag has only one cloud topic.",
+        default_value="", description="Topic of the clouds in the bag; if empty, /points or the only cloud topic."
     ),
     "config": dict(
         default_value="", description="Comma-separated parameter files, loaded after config/replay*.param.yaml."
@@ -88,7 +83,7 @@ def replay(context, argument_names):
     files = [*package_files, *list_parameter_files(value["config"])]
     use_large_shared_memory()  # set here because the nodes would treat the player as a sensor driver
     with Bag(value["bag"]) as bag:
-        cloud_topic = choose_cloud_topic(value["bag"], bag.topics, value["points"])
+        cloud_topic = choose_cloud_topic(bag, value["points"], "points:={topic}")
         topics = [t for t, kind in bag.topics.items() if t == cloud_topic or kind not in CLOUD_TYPES]
     sim_time = {"use_sim_time": value["use_sim_time"] == "true"}
     log_level = ["--log-level", value["log_level"]]

@@ -127,7 +127,7 @@ def quantile(values, fraction):
         fraction: level of the quantile, 0..1.
     """
     rank = fraction * (len(values) - 1)
-    k, low, high = int(rank), 0, len(values) - 1
+    k, low, high = int(rank), np.int64(0), len(values) - 1
     while low < high:  # Hoare's selection
         i, j = _partition(values, low, high)
         if k <= j:
@@ -319,7 +319,7 @@ def overlap_area(a, b, max_distance, buffer):
         local_y = a[4] / 2 if k < 2 else -a[4] / 2
         x[k] = centre_x + cos * local_x - sin * local_y
         y[k] = centre_y + sin * local_x + cos * local_y
-    count = _clip(x, y, 4, 1.0, b[3] / 2, cut_x, cut_y)
+    count = _clip(x, y, np.int64(4), 1.0, b[3] / 2, cut_x, cut_y)
     count = _clip(cut_x, cut_y, count, -1.0, b[3] / 2, x, y)
     count = _clip(y, x, count, 1.0, b[4] / 2, cut_y, cut_x)
     count = _clip(cut_y, cut_x, count, -1.0, b[4] / 2, y, x)

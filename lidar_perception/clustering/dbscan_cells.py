@@ -44,7 +44,7 @@ def _find_neighbour_cells(cell_z, column_start, neighbours):
     """List each pair of cells that can hold points within eps once, as first (P,) and second (P,)."""
     capacity = 12 * len(cell_z) + 16
     first, second = np.empty(capacity, np.int32), np.empty(capacity, np.int32)
-    count = 0
+    count = np.int64(0)
     for c in range(len(column_start) - 1):
         for k in range(neighbours.shape[1]):
             other = neighbours[c, k]

@@ -38,7 +38,7 @@ def build_grid(xyz, side, reach):
     column_x, column_y = np.empty(n, np.int64), np.empty(n, np.int64)
     column = np.empty(n, np.int32)
     z = np.empty(n, np.int64)
-    columns = 0
+    columns = np.int64(0)  # for a plain 0, Numba compiles counting_sort a second time
     scale = 1.0 / side
     for i in range(n):
         ix = np.int64(np.floor(np.float64(xyz[i, 0]) * scale))
@@ -102,7 +102,7 @@ def _sort_by_height(z):
     for shift in range(0, 64, 16):  # far outliers make too many levels to count them at once
         for i in range(len(z)):
             digit[i] = ((z[i] - low) >> shift) & 0xFFFF
-        order = counting_sort(digit, 0x10000, order)[0]
+        order = counting_sort(digit, np.int64(0x10000), order)[0]
     return order
 
 
@@ -136,7 +136,8 @@ def find_root(parent, i):
 def enlarge_array(values, count, capacity):
     """Copy values[:count] into a new array of this capacity."""
     enlarged = np.empty(capacity, values.dtype)
-    enlarged[:count] = values[:count]
+    for i in range(count):  # Numba takes seconds to compile an assignment of slices
+        enlarged[i] = values[i]
     return enlarged
 
 

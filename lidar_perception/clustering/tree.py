@@ -339,9 +339,8 @@ def find_touching_labels(tree, label, side, reach2, max_work):
         max_work, pairs are missing.
     """
     n = len(label)
-    remaining = np.empty((2, 2 * tree.leaves), np.int64)
-    for s in range(2):
-        remaining[s] = _find_box_maxima(tree, reach2 + np.zeros(n), side == s)[1]
+    limits = np.full(n, reach2)
+    remaining = (_find_box_maxima(tree, limits, side == 0)[1], _find_box_maxima(tree, limits, side == 1)[1])
     by_label, start = counting_sort(label, label.max() + 1, np.arange(n))
     leaf, pairs, count = _find_leaves(tree), np.empty((len(start), 2), np.int64), 0
     is_reached, stack, work = np.zeros(len(start), np.bool_), np.empty(STACK_SIZE, np.int64), 0

@@ -41,17 +41,18 @@ def can_open(path: Path) -> bool:
     return (path / METADATA_FILE).is_file() or bool(list_storage_files(path))
 
 
-def choose_cloud_topic(bag: Bag, points: str = "") -> str:
+def choose_cloud_topic(bag: Bag, points: str = "", example: str = "{bag}:{topic}") -> str:
     """Choose the topic of the clouds: `points` if given, otherwise /points, otherwise the only one.
 
-    Raises InputError if the bag has no such topic, or if the choice is ambiguous.
+    Raises InputError if the bag has no such topic, or if the choice is ambiguous; the message shows
+    how to choose a topic, as in `example`.
     """
     cloud_topics = find_cloud_topics(bag.topics)
     recorded_topics = [topic for topic in cloud_topics if bag.counts[topic]]
     if not points and POINTS not in recorded_topics and len(recorded_topics) > 1:
         raise InputError(
             f"{bag.path} has clouds on {', '.join(recorded_topics)}; choose a topic, as in "
-            f"{bag.path}:{recorded_topics[0]}"
+            + example.format(bag=bag.path, topic=recorded_topics[0])
         )
     if not points and not cloud_topics:
         others = {name: topic.type for name, topic in bag.unreadable.items()} | bag.topics
@@ -64,7 +65,10 @@ def choose_cloud_topic(bag: Bag, points: str = "") -> str:
     if bag.topics[topic] not in CLOUD_TYPES:
         raise InputError(
             f"{bag.path} has {bag.topics[topic]} on {topic} instead of clouds; "
-            + (diagnose_packets({topic: bag.topics[topic]}) or f"choose another topic, as in {bag.path}:/points")
+            + (
+                diagnose_packets({topic: bag.topics[topic]})
+                or f"choose another topic, as in {example.format(bag=bag.path, topic=POINTS)}"
+            )
         )
     return topic
 

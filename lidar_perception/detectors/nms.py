@@ -43,7 +43,7 @@ def rotated_nms(
         across_classes: boxes with different labels suppress each other too.
     """
     order = np.argsort(-scores, kind="stable")
-    group = np.zeros(len(order), np.int64) if across_classes else np.asarray(labels)[order]
+    group = np.zeros(len(order), np.int64) if across_classes else np.asarray(labels, np.int64)[order]
     sorted_boxes = np.asarray(boxes, np.float64).reshape(-1, 7)[order]
     return order[_select_best(sorted_boxes, group, iou, np.argsort(sorted_boxes[:, 0]))]
 

@@ -128,7 +128,8 @@ def _select_in_range(xyz, low, high):
         count += (low[0] <= x) & (x < high[0]) & (low[1] <= y) & (y < high[1]) & (low[2] <= z) & (z < high[2])
     selected = np.empty((count, 3), xyz.dtype)
     for i in range(count):
-        selected[i] = xyz[indices[i]]
+        for axis in range(3):  # Numba takes seconds to compile an assignment of rows
+            selected[i, axis] = xyz[indices[i], axis]
     return indices[:count].copy(), selected
 
 

@@ -91,7 +91,7 @@ def _segment(xyz, intensity, settings):
     p, ring = 0, 0
     for zone in range(len(RINGS)):
         for _ in range(RINGS[zone]):
-            flat_count, count = 0, 0
+            flat_count, count = np.int64(0), 0
             for _ in range(SECTORS[zone]):
                 begin, size = start[p], start[p + 1] - start[p]
                 p += 1

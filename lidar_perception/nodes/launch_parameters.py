@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ import yaml
 from lidar_perception.nodes.graph import DETECTOR_NODES, NETWORKS
 from lidar_perception.nodes.param_files import EVERY_NODE, is_for, read_sections
 from lidar_perception.types import InputError
-from lidar_perception.wire.clouds import diagnose_packets, find_cloud_topics
 
 CONFIGS = {"candidates": "perception", "pointpillars": "pointpillars", "pointnet": "pointnet", "fused": "fused"}
 
@@ -97,29 +95,3 @@ def _parse_weights(text: str, networks: list[str]) -> dict[str, str]:
             f"weights: '{unknown[0]}' is not one of {', '.join(networks)}; for several networks use NAME=FILE,NAME=FILE"
         )
     return pairs
-
-
-def choose_cloud_topic(bag: str, types: Mapping[str, str], topic: str = "") -> str:
-    """Return the topic if it is a cloud topic of a bag; if it is empty, the bag's only cloud topic.
-
-    Args:
-        bag: path of the bag, for messages.
-        types: {topic: its type} of the bag.
-        topic: requested topic.
-
-    Raises:
-        InputError: there is no such topic, or there are several; the message lists them.
-    """
-    clouds = find_cloud_topics(types)
-    if topic in clouds or (not topic and len(clouds) == 1):
-        return topic or clouds[0]
-    if not clouds:
-        raise InputError(
-            f"{bag} has no clouds: no topic has the type sensor_msgs/PointCloud2"
-            f"{'; ' + problem if (problem := diagnose_packets(types)) else ''}"
-        )
-    raise InputError(
-        f"{bag} has no clouds on {topic}; choose from {', '.join(clouds)}"
-        if topic
-        else f"{bag} has several cloud topics ({', '.join(clouds)}); choose one with points:=TOPIC"
-    )

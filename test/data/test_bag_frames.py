@@ -54,6 +54,22 @@ def find_scene(frame):
     return next(i for i in range(3) if same_cloud(make_scene(i), frame.load().xyz))
 
 
+def test_cloud_topic_is_chosen_or_the_available_ones_are_listed(tmp_path):
+    scan = bytes(8)
+    for name, topics in {"two": ["/a", "/b"], "default": ["/a", POINTS], "one": ["/a"]}.items():
+        with BagWriter(tmp_path / name) as bag:
+            for topic in [*topics, "/empty"]:
+                bag.add_topic(topic, "sensor_msgs/msg/PointCloud2")
+            for topic in topics:
+                bag.write(topic, STAMP, scan)
+    for name, points, expected in [("two", "/b", "/b"), ("default", "", POINTS), ("one", "", "/a")]:
+        with Bag(tmp_path / name) as bag:
+            assert bag_frames.choose_cloud_topic(bag, points) == expected
+    for name, points, words in [("two", "", "clouds on /a, /b; choose a topic, as in points:=/a"), ("one", "/c", "/c")]:
+        with Bag(tmp_path / name) as bag, pytest.raises(InputError, match=words):
+            bag_frames.choose_cloud_topic(bag, points, "points:={topic}")
+
+
 def test_first_frame_is_read_without_scanning_the_bag(sample_bag, monkeypatch):
     """Scanning an hour of clouds takes minutes, and many commands need only the first one."""
     stamped = []

@@ -12,10 +12,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from lidar_perception.nodes.launch_parameters import choose_cloud_topic
 from lidar_perception.nodes.replay import pacing
 from lidar_perception.runs.threads import PASSIVE_WAITING
-from lidar_perception.types import InputError
 
 
 def make_stamp(number):
@@ -75,19 +73,6 @@ def test_player_waits_full_timeout_only_once(monkeypatch):
     held = pace.held_s
     pace.wait_for_answers(serve, lambda: False)
     assert pace.missing_answers == 5 and not pace.unanswered_clouds and pace.held_s == held
-
-
-def test_cloud_topics_are_found_or_the_existing_ones_are_listed():
-    cloud = "sensor_msgs/msg/PointCloud2"
-    types = {"/velodyne": cloud, "/note": "std_msgs/msg/String"}
-    assert choose_cloud_topic("bag", types) == "/velodyne"
-    for types, topic, words in [
-        ({"/a": cloud, "/b": cloud}, "", r"cloud topics \(/a, /b\); choose one with points:=TOPIC"),
-        ({"/a": cloud}, "/points", "bag has no clouds on /points; choose from /a"),
-        ({"/note": "std_msgs/msg/String"}, "", "bag has no clouds"),
-    ]:
-        with pytest.raises(InputError, match=words):
-            choose_cloud_topic("bag", types, topic)
 
 
 @pytest.mark.parametrize("own", [{}, {"OMP_WAIT_POLICY": "active"}], ids=["ours", "the user's"])

@@ -65,7 +65,9 @@ def convolve(index, rows, cells, width, stride, weights, bias, sums, floor, firs
                     destinations[tile].ctypes.data,
                     floor,
                 )
-            destinations[:tiles] += 4 * BLOCK
+            for tile in range(tiles):
+                for i in range(ROWS):
+                    destinations[tile, i] += 4 * BLOCK
 
 
 @njit(cache=True, nogil=True)
