@@ -107,7 +107,7 @@ def segment_ground(
     pose = _set_params(defaults.sensor_pose, {"height": sensor_height})
     method_params = _set_params(getattr(defaults, method), params)
     return segment.segment_ground(
-        _make_cloud(xyz, intensity), replace(defaults, method=method, sensor_pose=pose, **{method: method_params})
+        as_point_cloud(xyz, intensity), replace(defaults, method=method, sensor_pose=pose, **{method: method_params})
     )
 
 
@@ -270,12 +270,6 @@ def simulate(
     return simulate_recording(
         seed, frames, find_sensor(sensor, sensor_height or 0.0), scenes=Scenes(kind, people, scene)
     )
-
-
-def _make_cloud(xyz: PointCloud | ArrayLike, intensity: ArrayLike | None) -> PointCloud:
-    if intensity is not None and isinstance(xyz, PointCloud):
-        raise InputError("a PointCloud already has an intensity; pass either a PointCloud, or arrays with an intensity")
-    return as_point_cloud(xyz, intensity)
 
 
 def _set_params(params: P, values: Mapping[str, Any]) -> P:

@@ -170,6 +170,10 @@ def as_point_cloud(
     Arguments and errors are those of PointCloud.of.
     """
     if isinstance(cloud, PointCloud):
+        if intensity is not None:
+            raise InputError(
+                "a PointCloud already has an intensity; pass either a PointCloud, or arrays with an intensity"
+            )
         return cloud
     points = _to_numbers(
         cloud,

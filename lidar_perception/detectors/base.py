@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 
 from lidar_perception.detectors.contract import Cloud, DetectionResult, check_input, join_problems
-from lidar_perception.detectors.params import NetworkParams, ScoreParams
+from lidar_perception.detectors.params import ConfiguredDetector, NetworkParams
 from lidar_perception.detectors.trained_network import TrainedNetwork
-from lidar_perception.ground.params import SensorPoseParams, set_sensor_height
+from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.segment import crop_with_sensor_pose
 from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
 
 
-class NetworkDetector:
-    """Base class of detectors with neural networks.
+class NetworkDetector(ConfiguredDetector):
+    """Base class of detectors with neural networks; their own parameters are NetworkParams.
 
     Attributes:
-        params: parameters of the detector's node, a dataclass of groups such as crop and ground.
         warning: reason why scores are unreliable or classes are never detected, or None.
     """
-
-    group: ClassVar[str]  # name of the detector's own parameter group (a NetworkParams)
 
     def __init__(self, params: Any, warning: str | None = None):
         self.params, self.warning = params, warning
@@ -57,8 +53,7 @@ class NetworkDetector:
 
     @property
     def settings(self) -> NetworkParams:
-        """The detector's own parameter group: the attribute of `params` whose name is `group`."""
-        return getattr(self.params, self.group)
+        return super().settings
 
     @property
     def device(self) -> str:
@@ -76,34 +71,13 @@ class NetworkDetector:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of the detectable classes."""
         return self.networks[0].classes
-
-    @property
-    def min_scores(self) -> dict[str, float]:
-        """Score threshold of each class, 0..1."""
-        return self.settings.scores.get_all(self.classes)
 
     @property
     def range(self) -> str:
         """Covered area: "ahead" (in front of the sensor) or "around" (all directions)."""
         low = getattr(self.networks[0].config, "low", None)  # PointNet has no range
         return "around" if low is None or low[0] < 0 else "ahead"
-
-    def with_params(self, params: Any) -> Self:
-        """Return a copy of this detector with different parameters and the same networks."""
-        other = copy.copy(self)
-        other.params = params
-        return other
-
-    def with_min_score(self, min_score: float) -> Self:
-        """Return a copy of this detector with one threshold for all classes."""
-        settings = replace(self.settings, scores=ScoreParams.for_all_classes(min_score))
-        return self.with_params(replace(self.params, **{self.group: settings}))
-
-    def with_sensor_height(self, height: float) -> Self:
-        """Return a copy of this detector for a sensor `height` metres above the ground."""
-        return self.with_params(set_sensor_height(self.params, height))
 
     def with_range(self, range: str) -> Self:
         """Return a copy of this detector with a different range.

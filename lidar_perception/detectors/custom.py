@@ -7,8 +7,8 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -19,8 +19,8 @@ import numpy as np
 
 from lidar_perception.classes import DETECTED
 from lidar_perception.detectors.contract import Cloud, DetectionResult, Detector, check_input
-from lidar_perception.detectors.params import ScoreParams
-from lidar_perception.ground.params import SensorPoseParams, set_sensor_height
+from lidar_perception.detectors.params import ConfiguredDetector, ScoreParams
+from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.param_fields import Params
 from lidar_perception.robot.params import CropParams
 from lidar_perception.types import (
@@ -62,15 +62,13 @@ class CustomDetectorParams:
 
 
 @dataclass
-class CustomDetector:
+class CustomDetector(ConfiguredDetector):
     """Adapter that makes a contract.Detector from a function that returns Detections for a cloud.
 
     Attributes:
         name: name of the detector in messages.
         build: function that returns the detection function for a sensor height in metres.
         classes: names of the detectable classes.
-        params: parameter groups: crop, ground, and `group` with the score thresholds.
-        group: name of the parameter group with the score thresholds.
         device: device name shown in the status of a node.
     """
 
@@ -80,30 +78,6 @@ class CustomDetector:
     params: Any = field(default_factory=CustomDetectorParams)
     group: str = "custom"
     device: str = "auto"
-
-    @property
-    def scores(self) -> ScoreParams:
-        """Score thresholds by class."""
-        return getattr(self.params, self.group).scores
-
-    @property
-    def min_scores(self) -> Mapping[str, float]:
-        """Minimum score of a detection, by class."""
-        return {name: self.scores.get(name) for name in self.classes}
-
-    def with_params(self, params: Any) -> CustomDetector:
-        """Return a copy of this detector with different parameters."""
-        return replace(self, params=params)
-
-    def with_min_score(self, min_score: float) -> CustomDetector:
-        """Return a copy of this detector with one threshold for all classes."""
-        scores = ScoreParams.for_all_classes(min_score)
-        group = replace(getattr(self.params, self.group), scores=scores)
-        return self.with_params(replace(self.params, **{self.group: group}))
-
-    def with_sensor_height(self, height: float) -> CustomDetector:
-        """Return a copy of this detector for a sensor `height` metres above the ground."""
-        return self.with_params(set_sensor_height(self.params, height))
 
     def __call__(
         self, cloud: Cloud, *, ground: np.ndarray | None = None, cluster_ids: np.ndarray | None = None
@@ -127,7 +101,7 @@ class CustomDetector:
                 f"{self.name} returned {type(detections).__name__} instead of Detections, such as "
                 "lidar_perception.Detections.of(boxes, class_ids, scores)"
             )
-        return DetectionResult(detections[self.scores.passes(detections)], {"detect": milliseconds}, problem)
+        return DetectionResult(detections[self.settings.scores.passes(detections)], {"detect": milliseconds}, problem)
 
 
 def as_detector(detector: Detector | Callable[[PointCloud], Detections]) -> Detector:

@@ -1,13 +1,15 @@
-"""Parameters that all detectors with networks share."""
+"""Parameters that all detectors with networks share, and the base class of detectors with parameters."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 
+from lidar_perception.ground.params import set_sensor_height
 from lidar_perception.param_fields import Params, param
 from lidar_perception.types import CLASSES, Detections
 
@@ -126,3 +128,45 @@ class NetworkParams(Params):
     )
     scores: ScoreParams = ScoreParams()
     nms: NmsParams = NmsParams()
+
+
+class ConfiguredDetector:
+    """Base class of detectors with parameters.
+
+    Attributes:
+        params: parameters of the detector's node, a dataclass of groups such as crop and ground.
+        group: name of the group with the detector's own parameters, among them the scores.
+    """
+
+    params: Any
+    group: str
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the detectable classes."""
+        raise NotImplementedError
+
+    @property
+    def settings(self) -> Any:
+        """Parameter group with the detector's own parameters."""
+        return getattr(self.params, self.group)
+
+    @property
+    def min_scores(self) -> dict[str, float]:
+        """Score threshold of each class, 0..1."""
+        return self.settings.scores.get_all(self.classes)
+
+    def with_params(self, params: Any) -> Self:
+        """Return a copy of this detector with different parameters."""
+        other = copy.copy(self)
+        other.params = params
+        return other
+
+    def with_min_score(self, min_score: float) -> Self:
+        """Return a copy of this detector with one threshold for all classes."""
+        settings = replace(self.settings, scores=ScoreParams.for_all_classes(min_score))
+        return self.with_params(replace(self.params, **{self.group: settings}))
+
+    def with_sensor_height(self, height: float) -> Self:
+        """Return a copy of this detector for a sensor `height` metres above the ground."""
+        return self.with_params(set_sensor_height(self.params, height))
