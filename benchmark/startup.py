@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,9 @@ CODE_BY_NAME = {
     "ground segmentation": "from lidar_perception.params import GroundNodeParams as P; "
     "from lidar_perception.candidates.warm_up import warm_up_ground; "
     "warm_up_ground(P().ground)",
+    "tracker": "from lidar_perception.tracking.tracker import warm_up; warm_up()",
 }
+NODES = "fused", "clustering", "ground segmentation", "tracker"
 PRINT_USAGE = """
 import resource
 usage = resource.getrusage(resource.RUSAGE_SELF)
@@ -35,7 +38,7 @@ print(usage.ru_utime + usage.ru_stime, int(status.split('VmHWM:')[1].split()[0])
 WITH_TORCH = "fused, engine torch"
 
 
-def measure_startup(repeat: int, cold_starts: tuple[str, ...] = ("fused", "clustering")) -> dict:
+def measure_startup(repeat: int, cold_starts: Sequence[str] = NODES) -> dict:
     """Measure the start of processes.
 
     Args:
@@ -52,6 +55,7 @@ def measure_startup(repeat: int, cold_starts: tuple[str, ...] = ("fused", "clust
             value=runs[WITH_TORCH][0] / runs["fused"][0],
         )
     ]
+    rows += [make_row(f"{name}, full cache", ours_ms=1e3 * runs[name][0]) for name in runs if name != WITH_TORCH]
     rows += [make_row(f"{name}, peak memory", value=memory, unit="MB") for name, (_, memory) in runs.items()]
     for name in cold_starts:
         with tempfile.TemporaryDirectory() as folder:
