@@ -206,7 +206,7 @@ def read_recorded_results(poses: BagPoses, stamps: list[int]) -> Results:
 
     A topic whose boxes cannot be transformed to the clouds' frame is skipped with a warning.
     """
-    bag = poses.handle.bag()
+    bag = poses.handle.get_bag()
     topics = {
         topic
         for topic, kind in bag.topics.items()

@@ -134,7 +134,7 @@ def from_array(points: np.ndarray, header: Any, make: Any, *, height: int = 1, i
     data = np.ascontiguousarray(points).view(np.uint8).reshape(-1)
     byte_orders = {points.dtype[n].base.byteorder for n in points.dtype.names or ()} - {"|"}
     if len(byte_orders) > 1:
-        raise ValueError("a cloud cannot have fields of both byte orders")
+        raise ValueError("the fields have different byte orders, but a cloud has one; convert them to the same")
     return _make_cloud(
         header,
         make,

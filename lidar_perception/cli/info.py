@@ -56,7 +56,10 @@ def _describe_bag(path: Path) -> dict[str, Any]:
                     "type": type_name,
                     "messages": bag.counts[topic],
                     "qos": next(
-                        (f"{qos.reliability.name.lower()}, {qos.durability.name.lower()}" for qos in bag.qos(topic)),
+                        (
+                            f"{qos.reliability.name.lower()}, {qos.durability.name.lower()}"
+                            for qos in bag.find_qos(topic)
+                        ),
                         None,
                     ),
                 }

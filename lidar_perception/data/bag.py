@@ -78,7 +78,7 @@ class BagWriter:
     def __init__(self, path: str | Path, *, force: bool = False, compression: str = "zstd"):
         self.path, self.force, self.compression = Path(path), force, COMPRESSIONS[compression]
         require_name(self.path)
-        self.partial = self.path.with_name(self.path.name + ".incomplete")
+        self.incomplete_path = self.path.with_name(self.path.name + ".incomplete")
         self.channels: dict[str, int] = {}
         self.topics: dict[str, dict] = {}  # entries of metadata.yaml, by name
         self.times: list[int] = []
@@ -93,11 +93,11 @@ class BagWriter:
 
     def __enter__(self) -> BagWriter:
         with ExitStack() as stack, self._convert_write_errors():
-            stack.enter_context(lock_folder(self.partial))
+            stack.enter_context(lock_folder(self.incomplete_path))
             self._check_target()  # another process may have written the file in the meantime
-            for old in self.partial.iterdir():
+            for old in self.incomplete_path.iterdir():
                 shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
-            self.file = stack.enter_context(RecordFile(self.partial / f"{self.path.name}.mcap"))
+            self.file = stack.enter_context(RecordFile(self.incomplete_path / f"{self.path.name}.mcap"))
             stream = cast(IO[bytes], self.file)  # mcap only calls write, tell and flush
             self.mcap = Writer(stream, chunk_size=CHUNK_BYTES, compression=self.compression)
             self.mcap.start(profile="ros2", library="lidar_perception")
@@ -111,7 +111,7 @@ class BagWriter:
         except OSError as error:
             raise InputError(
                 f"cannot write the bag {self.path}: {error.strerror or error}; the "
-                f"messages written so far are in {self.partial}"
+                f"messages written so far are in {self.incomplete_path}"
             ) from None
 
     def add_topic(self, topic: str, type_name: str, qos: dict = SENSOR_QOS) -> None:
@@ -149,14 +149,14 @@ class BagWriter:
             except OSError:
                 # A bag without an index and without metadata.yaml is still valid.
                 self.file.close_with(NO_INDEX)
-                (self.partial / "metadata.yaml").unlink(missing_ok=True)
+                (self.incomplete_path / "metadata.yaml").unlink(missing_ok=True)
                 if error_type is None:
                     raise
                 return  # the exception that ended the context propagates
             if error_type is None:
                 if self.path.exists():
                     shutil.rmtree(self.path)
-                self.partial.rename(self.path)
+                self.incomplete_path.rename(self.path)
 
     def _finish(self) -> None:
         start = min(self.times, default=0)
@@ -182,7 +182,7 @@ class BagWriter:
         self.mcap.add_metadata("rosbag2", {"serialized_metadata": _to_yaml(info)})
         self.mcap.finish()
         self.file.sync()
-        with open(self.partial / "metadata.yaml", "w") as stream:
+        with open(self.incomplete_path / "metadata.yaml", "w") as stream:
             stream.write(_to_yaml({"rosbag2_bagfile_information": info}))
             stream.flush()
             os.fsync(stream.fileno())
@@ -287,7 +287,7 @@ class Bag:
             or "nothing"
         )
 
-    def qos(self, topic: str) -> list[Qos]:
+    def find_qos(self, topic: str) -> list[Qos]:
         """Return the recorded QoS profiles of a topic; [] if unknown.
 
         Profiles in metadata.yaml take precedence, because people edit it for `ros2 bag play`.
@@ -378,7 +378,7 @@ class BagHandle:
     def __reduce__(self) -> tuple[type[BagHandle], tuple[Path, bool]]:
         return BagHandle, (self.path, False)
 
-    def bag(self) -> Bag:
+    def get_bag(self) -> Bag:
         """Return the bag, opened by the first call in this thread."""
         if getattr(self._local, "process", None) != os.getpid():  # a forked process must not share open files
             self._local.bag, self._local.process = Bag(self.path, warn=self.warn), os.getpid()

@@ -76,7 +76,7 @@ def choose_cloud_topic(bag: Bag, points: str = "", example: str = "{bag}:{topic}
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
     """Open the clouds on a topic of a bag, see choose_cloud_topic."""
     handle = BagHandle(path)
-    bag = handle.bag()
+    bag = handle.get_bag()
     points = choose_cloud_topic(bag, points)
     topics = {topic for topic, count in bag.counts.items() if count}
     frames = BagFrames(handle, points, bag.topics[points], bag.counts[points])
@@ -86,10 +86,9 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
         has_point_labels = (
             frames.first_message is not None and frames.decode_labelled_cloud(frames.first_message[1]) is not None
         )
-    contents = frozenset(content for content, required in TOPICS_BY_CONTENT.items() if required <= topics) | {
-        *[POINT_LABELS] * has_point_labels,
-        *[POSES] * frames.poses.has_poses,
-    }
+    contents = frozenset(
+        content for content, required_topics in TOPICS_BY_CONTENT.items() if required_topics <= topics
+    ) | {*[POINT_LABELS] * has_point_labels, *[POSES] * frames.poses.has_poses}
     return Recording(
         path, f"{bag.layout}, clouds on {points}", frames, contents, has_sensor_height=False, has_times=True
     )
@@ -126,7 +125,7 @@ class BagFrames(Sequence):
         stamp_counts: Counter[int] = Counter()
         with Bag(self.path, warn=False) as bag:
             for i, (_, time, data) in enumerate(bag.raw_messages({self.points})):
-                stamp = self._stamp(data, time)
+                stamp = self._find_stamp(data, time)
                 stamp_counts[stamp] += 1
                 yield self._make_frame(i, time, stamp, stamp_counts[stamp], partial(bytes, data))
 
@@ -147,7 +146,7 @@ class BagFrames(Sequence):
         i %= self.cloud_count
         if i == 0 and self.first_message is not None:
             time, data = self.first_message
-            return self._make_frame(0, time, self._stamp(data, time), 1, lambda: data)
+            return self._make_frame(0, time, self._find_stamp(data, time), 1, lambda: data)
         time, earlier_count, stamp, occurrence = self._index[i]
         return self._make_frame(i, time, stamp, occurrence, partial(self._read, time, earlier_count))
 
@@ -158,15 +157,15 @@ class BagFrames(Sequence):
         time_counts: Counter[int] = Counter()
         stamp_counts: Counter[int] = Counter()
         rows = []
-        for _, time, data in self.handle.bag().raw_messages({self.points}):
-            stamp = self._stamp(data, time)
+        for _, time, data in self.handle.get_bag().raw_messages({self.points}):
+            stamp = self._find_stamp(data, time)
             stamp_counts[stamp] += 1
             rows.append((time, time_counts[time], stamp, stamp_counts[stamp]))
             time_counts[time] += 1
         return rows
 
     def _read(self, time: int, earlier_count: int) -> bytes:
-        messages = self.handle.bag().raw_messages({self.points}, time, time + 1)
+        messages = self.handle.get_bag().raw_messages({self.points}, time, time + 1)
         return next(islice(messages, earlier_count, None))[2]
 
     @cached_property
@@ -178,7 +177,7 @@ class BagFrames(Sequence):
         truth: dict[int, GroundTruth] = {}
         infos: list[tuple[int, Any]] = []
         transforms: list[tuple[int, Any]] = []
-        bag = self.handle.bag()
+        bag = self.handle.get_bag()
         for topic, time, msg in bag.messages({TRUTH, CAMERA_INFO, EXTRINSICS} & {*bag.topics}):
             if topic == TRUTH:
                 objects = from_marker_array(msg)
@@ -199,10 +198,10 @@ class BagFrames(Sequence):
     @cached_property
     def first_message(self) -> tuple[int, bytes] | None:
         """Time and serialized message of the first cloud; None without clouds."""
-        raw = self.handle.bag().raw_messages({self.points})
+        raw = self.handle.get_bag().raw_messages({self.points})
         return next(((time, bytes(data)) for _, time, data in raw), None)
 
-    def _stamp(self, data: bytes, time: int) -> int:
+    def _find_stamp(self, data: bytes, time: int) -> int:
         """Return header.stamp of a serialized cloud in ns.
 
         The log time is used if all clouds lack a stamp, or if the message is too short.
@@ -214,7 +213,7 @@ class BagFrames(Sequence):
     @cached_property
     def _has_no_stamps(self) -> bool:
         """True if all stamps are 0; at the start of simulated time only a few are."""
-        messages = self.handle.bag().raw_messages({self.points})
+        messages = self.handle.get_bag().raw_messages({self.points})
         return not any(_read_header_stamp(data) for *_, data in messages)
 
     @cached_property
@@ -223,11 +222,13 @@ class BagFrames(Sequence):
 
         It is inferred from the first clouds, because reading others would take too long.
         """
-        return infer_scale(self._first_clouds(), lambda data: read_raw_intensity(decode_cloud(data, self.message_type)))
+        return infer_scale(
+            self._read_first_clouds(), lambda data: read_raw_intensity(decode_cloud(data, self.message_type))
+        )
 
-    def _first_clouds(self) -> Iterator[bytes]:
+    def _read_first_clouds(self) -> Iterator[bytes]:
         with suppress(InputError):  # reported when the frame is read
-            for _, _, data in islice(self.handle.bag().raw_messages({self.points}), MAX_READ):
+            for _, _, data in islice(self.handle.get_bag().raw_messages({self.points}), MAX_READ):
                 yield bytes(data)
 
     @cached_property

@@ -90,12 +90,14 @@ def add_differences(metadata: Metadata, counts: Mapping[str, int], start_ns: int
     for topic, (_, count) in metadata.topics.items():
         if count != counts.get(topic, 0):
             metadata.problems.append(f"it declares {count} messages on {topic}, the files have {counts.get(topic, 0)}")
-    for name, declared, actual in (
+    for name, declared_ns, actual_ns in (
         ("start", metadata.start_ns, start_ns),
         ("duration", metadata.duration_ns, duration_ns),
     ):
-        if any(counts.values()) and declared is not None and abs(declared - actual) > TOLERANCE_NS:
-            metadata.problems.append(f"it declares a {name} of {declared / 1e9:.3f} s instead of {actual / 1e9:.3f} s")
+        if any(counts.values()) and declared_ns is not None and abs(declared_ns - actual_ns) > TOLERANCE_NS:
+            metadata.problems.append(
+                f"it declares a {name} of {declared_ns / 1e9:.3f} s instead of {actual_ns / 1e9:.3f} s"
+            )
 
 
 def _read_number(tree: Mapping[str, Any], *keys: str) -> int:

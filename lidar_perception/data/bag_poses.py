@@ -48,7 +48,7 @@ class BagPoses:
     def __init__(self, handle: BagHandle, frame_id: str):
         self.handle, self.path, self.frame_id = handle, handle.path, frame_id.lstrip("/")
         self.invalid_count = 0  # number of transforms and odometry messages without a valid pose
-        bag = self.handle.bag()
+        bag = self.handle.get_bag()
         topics = {name: type_name for name, type_name in bag.topics.items() if bag.counts[name]}
         self.transform_topics = {name for name in (TF, TF_STATIC) if topics.get(name) == TF_MESSAGE}
         self.odometry_topic = choose_odometry_topic(topics)
@@ -94,7 +94,7 @@ class BagPoses:
     @cached_property
     def _first_odometry(self) -> Any:
         """First odometry message."""
-        return next(msg for *_, msg in self.handle.bag().messages({self.odometry_topic}))
+        return next(msg for *_, msg in self.handle.get_bag().messages({self.odometry_topic}))
 
     @cached_property
     def fixed_frame(self) -> str:
@@ -178,7 +178,7 @@ class BagPoses:
     @cached_property
     def _odometry(self) -> TransformTree:
         tree = TransformTree(keeps_all=True)
-        for _, _, msg in self.handle.bag().messages({self.odometry_topic} - {""}):
+        for _, _, msg in self.handle.get_bag().messages({self.odometry_topic} - {""}):
             try:
                 add_odometry(tree, msg)
             except InputError:
@@ -189,7 +189,7 @@ class BagPoses:
     def _first_transforms(self) -> TransformTree:
         """Static transforms, and those on /tf until an ancestor of the sensor moves."""
         tree = TransformTree(keeps_all=True)
-        bag = self.handle.bag()
+        bag = self.handle.get_bag()
         for _, _, msg in bag.messages({TF_STATIC} & self.transform_topics):
             self._add(tree, msg, True)
         for i, (_, _, msg) in enumerate(bag.messages({TF} & self.transform_topics)):
@@ -212,7 +212,7 @@ class BagPoses:
         """All transforms of the sensor, of the odometry's child frame, and of their ancestors."""
         tree = TransformTree(keeps_all=True)
         frames = {*self._ancestors, *self._list_parents(self.odometry_child_frame)}
-        for topic, _, msg in self.handle.bag().messages(self.transform_topics):
+        for topic, _, msg in self.handle.get_bag().messages(self.transform_topics):
             msg.transforms[:] = [
                 transform for transform in msg.transforms if transform.child_frame_id.lstrip("/") in frames
             ]

@@ -99,8 +99,8 @@ def read_points(file: Path) -> np.ndarray:
     x, y or z.
     """
     points = _rename_columns(READERS[file.suffix.lower()](file))
-    if missing := {"x", "y", "z"} - set(points.dtype.names or ()):
-        raise InputError(f"{file} has no field {min(missing)}, so it is not a point cloud")
+    if missing_fields := {"x", "y", "z"} - set(points.dtype.names or ()):
+        raise InputError(f"{file} has no field {min(missing_fields)}, so it is not a point cloud")
     return points
 
 

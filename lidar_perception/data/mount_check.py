@@ -38,18 +38,18 @@ def measure_sensor_height(xyz: np.ndarray, pose: SensorPoseParams = SensorPosePa
     return None if plane is None else -float(plane[2])
 
 
-def find_height_problem(measured: float | None, pose: SensorPoseParams) -> str | None:
+def find_height_problem(measured_height: float | None, pose: SensorPoseParams) -> str | None:
     """Describe a wrong height in sensor_pose, with the remedy; None if it matches the measured height."""
-    if measured is None or abs(measured - pose.height) <= HEIGHT_TOLERANCE_M:
+    if measured_height is None or abs(measured_height - pose.height) <= HEIGHT_TOLERANCE_M:
         return None
-    if measured < 0:
+    if measured_height < 0:
         return (
-            f"the ground seems to be {-measured:.2f} m above the sensor; if it is mounted "
+            f"the ground seems to be {-measured_height:.2f} m above the sensor; if it is mounted "
             "upside down, set ground.sensor_pose.roll to 3.1416"
         )
     return (
-        f"the sensor is {measured:.2f} m above the ground but ground.sensor_pose.height is "
-        f"{pose.height:g}; set it to {measured:.2f}"
+        f"the sensor is {measured_height:.2f} m above the ground but ground.sensor_pose.height is "
+        f"{pose.height:g}; set it to {measured_height:.2f}"
     )
 
 
@@ -103,34 +103,34 @@ def find_mount_problem(recording: Recording, clouds: Sequence[PointCloud]) -> st
 
 def _find_floor(xyz: np.ndarray, params: ThresholdParams = FLOOR_PLANE) -> np.ndarray | None:
     """Return the plane z = a x + b y + c, (3,), of the ground in points (N, 3)."""
-    nearby = _select_nearby(xyz)
-    lowest = _find_lowest_points(nearby)
+    nearby_points = _select_nearby_points(xyz)
+    lowest = _find_lowest_points(nearby_points)
     if len(lowest) < MIN_CELLS:
         return None
     plane = fit_plane_by_ransac(lowest, params)
     if plane is None:
         return None
-    if plane[2] > 0 and (compute_height_above_plane(nearby, plane) > MIN_BEYOND_M).mean() > MAX_BEYOND_FRACTION:
+    if plane[2] > 0 and (compute_height_above_plane(nearby_points, plane) > MIN_BEYOND_M).mean() > MAX_BEYOND_FRACTION:
         return None
     on_plane = np.abs(compute_height_above_plane(lowest, plane)) <= params.inlier_distance
     return plane if on_plane.mean() >= MIN_FLOOR_FRACTION else None
 
 
-def _select_nearby(xyz: np.ndarray) -> np.ndarray:
+def _select_nearby_points(xyz: np.ndarray) -> np.ndarray:
     """Return the points (M, 3) between MIN_RANGE_M and MAX_RANGE_M."""
     squared_range = np.einsum("ij,ij->i", xyz[:, :2], xyz[:, :2])
     return xyz.compress((squared_range >= MIN_RANGE_M**2) & (squared_range <= MAX_RANGE_M**2), axis=0)
 
 
-def _find_lowest_points(nearby: np.ndarray) -> np.ndarray:
+def _find_lowest_points(nearby_points: np.ndarray) -> np.ndarray:
     """Return the lowest point of each grid cell, (K, 3)."""
     side = 2 * round(MAX_RANGE_M / CELL_M) + 1
-    column, row = np.floor((nearby[:, :2] + MAX_RANGE_M) / CELL_M).astype(np.int64).T
+    column, row = np.floor((nearby_points[:, :2] + MAX_RANGE_M) / CELL_M).astype(np.int64).T
     cells = row * side + column
-    min_z = np.full(side * side, np.inf, nearby.dtype)
-    np.minimum.at(min_z, cells, nearby[:, 2])
-    lowest = np.flatnonzero(nearby[:, 2] == min_z[cells])
-    return nearby[lowest[np.unique(cells[lowest], return_index=True)[1]]]
+    min_z = np.full(side * side, np.inf, nearby_points.dtype)
+    np.minimum.at(min_z, cells, nearby_points[:, 2])
+    lowest = np.flatnonzero(nearby_points[:, 2] == min_z[cells])
+    return nearby_points[lowest[np.unique(cells[lowest], return_index=True)[1]]]
 
 
 def _find_floors(clouds: Sequence[PointCloud], params: ThresholdParams = FLOOR_PLANE) -> np.ndarray:

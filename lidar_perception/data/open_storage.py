@@ -58,28 +58,28 @@ def find_files(path: Path, metadata: Metadata) -> list[Path]:
         )
     for file in path.iterdir():
         check_regular(file)
-    existing = list_storage_files(path)
+    existing_files = list_storage_files(path)
     if not (path / METADATA_FILE).exists():
-        if len(existing) == 1 or (existing and _are_parts_of_one_bag(existing)):
-            return existing
+        if len(existing_files) == 1 or (existing_files and _are_parts_of_one_bag(existing_files)):
+            return existing_files
         raise InputError(
-            f"{path} is not a rosbag2 bag: it has no metadata.yaml and {len(existing)} "
+            f"{path} is not a rosbag2 bag: it has no metadata.yaml and {len(existing_files)} "
             "storage files; run 'ros2 bag reindex' or give one .mcap file"
         )
-    missing = [name for name in metadata.files if not (path / name).is_file()]
-    if not missing and metadata.files:
+    missing_names = [name for name in metadata.files if not (path / name).is_file()]
+    if not missing_names and metadata.files:
         return [path / name for name in metadata.files]
-    if not existing:
+    if not existing_files:
         raise InputError(
             f"the bag {path} is truncated or damaged: its metadata.yaml lists "
-            f"{', '.join(missing) or 'no file'}, but the folder has no storage file; copy "
+            f"{', '.join(missing_names) or 'no file'}, but the folder has no storage file; copy "
             "the folder again"
         )
-    if missing:
+    if missing_names:
         metadata.problems.append(
-            f"it lists {', '.join(missing)} instead of {', '.join(file.name for file in existing)}"
+            f"it lists {', '.join(missing_names)} instead of {', '.join(file.name for file in existing_files)}"
         )
-    return existing
+    return existing_files
 
 
 def open_file(path: Path, stack: ExitStack) -> StorageFile:

@@ -78,7 +78,7 @@ def open_clouds(path: str | Path, topic: str | None = None) -> RawClouds:
 
 def _open_bag(path: Path, topic: str) -> RawClouds:
     handle = BagHandle(path)
-    bag = handle.bag()
+    bag = handle.get_bag()
     topic = bag_frames.choose_cloud_topic(bag, topic)
     if not bag.counts[topic]:
         raise InputError(f"{path} has no clouds on {topic}; record it again")

@@ -33,10 +33,10 @@ class RecordFile:
     def write(self, record: bytes) -> int:
         if self.failure:
             raise self.failure
-        remaining = memoryview(record)
+        remaining_bytes = memoryview(record)
         try:
-            while remaining:
-                remaining = remaining[self.file.write(remaining) :]
+            while remaining_bytes:
+                remaining_bytes = remaining_bytes[self.file.write(remaining_bytes) :]
         except OSError as error:
             self.failure = error
             self._truncate(self.tell())

@@ -32,7 +32,7 @@ class Ros1File:
 
         self.reader = AnyReader([path])
         self.reader.open()
-        self.recorded = {connection.id: connection for connection in self.reader.connections}
+        self.connection_by_id = {connection.id: connection for connection in self.reader.connections}
         self.topics = []
         for connection in self.reader.connections:
             type_name = STATIC_MSGTYPE_RENAMES.get(connection.msgtype, connection.msgtype)
@@ -48,7 +48,7 @@ class Ros1File:
             )
         cache: dict[str, object] = {}
         self.converters = {
-            topic.id: self._make_converter(self.recorded[topic.id].msgtype, topic.type, cache)
+            topic.id: self._make_converter(self.connection_by_id[topic.id].msgtype, topic.type, cache)
             for topic in self.topics
             if topic.encoding == "cdr"
         }
@@ -62,7 +62,7 @@ class Ros1File:
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
         """Yield (topic id, time, CDR bytes) of topics with start <= time < stop, in order of time."""
-        connections = [self.recorded[topic_id] for topic_id in ids]
+        connections = [self.connection_by_id[topic_id] for topic_id in ids]
         for connection, time, data in self.reader.messages(connections, start, stop):
             yield connection.id, time, bytes(self.converters[connection.id](data))
 

@@ -27,20 +27,20 @@ class Arrivals:
         self.stamps: deque[tuple[int, int]] = deque(maxlen=RATE_SAMPLES + 1)  # (sequence number, time of sending in ns)
         self.expected_rate: float | None = None  # rate of the first clouds, Hz; None before it is known
 
-    def add(self, infos: list[dict], dropped: int, one_publisher: bool = True) -> None:
+    def add(self, infos: list[dict], dropped: int, has_one_publisher: bool = True) -> None:
         """Count messages.
 
         Args:
             infos: rclpy's message infos of all messages that were in the queue, oldest first.
             dropped: number of these messages that are not processed.
-            one_publisher: False with several publishers, whose numbers cannot be compared.
+            has_one_publisher: False with several publishers, whose numbers cannot be compared.
         """
         queue_was_full = len(infos) >= self.depth
         for i, info in enumerate(infos):
             number, gap = info["publication_sequence_number"], 0
-            if one_publisher and number and self.sequence is not None and number > self.sequence:
+            if has_one_publisher and number and self.sequence is not None and number > self.sequence:
                 gap = number - self.sequence - 1
-            self.sequence = (number or None) if one_publisher else None
+            self.sequence = (number or None) if has_one_publisher else None
             if queue_was_full and i == 0:
                 self.dropped += gap
             else:

@@ -99,7 +99,7 @@ class DetectorNode(ManagedNode):
         weights = self.find_weights()
         from lidar_perception.detectors.devices import find_device
 
-        # main.py sets the default to one thread.
+        # This replaces the limit of one thread per process from main.py.
         set_thread_count(network_params.threads or count_cores())
         device = network_params.device
         if device.startswith("cuda") and network_params.cpu_fallback:

@@ -81,9 +81,9 @@ class Diagnostics:
         self.last_stamp_ns = stamp_ns
         begin = perf_counter()
         yield
-        elapsed = (perf_counter() - begin) * 1e3
-        self._processing_time.publish(Float64(data=elapsed))
-        self._times_ms = [*self._times_ms[1 - TIMED_FRAMES :], elapsed]
+        elapsed_ms = (perf_counter() - begin) * 1e3
+        self._processing_time.publish(Float64(data=elapsed_ms))
+        self._times_ms = [*self._times_ms[1 - TIMED_FRAMES :], elapsed_ms]
         self.counts["frames"] += 1
 
     def report(self, level: bytes, message: str, expected: bool = False) -> None:

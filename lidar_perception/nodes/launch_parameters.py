@@ -18,8 +18,8 @@ CONFIGS = {"candidates": "perception", "pointpillars": "pointpillars", "pointnet
 def list_parameter_files(config: str) -> list[str]:
     """Return the files in the launch argument `config`. Raises InputError if one does not exist."""
     files = [config] if Path(config).is_file() else [f for f in config.split(",") if f]
-    if missing := [file for file in files if not Path(file).is_file()]:
-        raise InputError(f"config: parameter file not found: {missing[0]}")
+    if missing_files := [file for file in files if not Path(file).is_file()]:
+        raise InputError(f"config: parameter file not found: {missing_files[0]}")
     return files
 
 
@@ -90,8 +90,9 @@ def _parse_weights(text: str, networks: list[str]) -> dict[str, str]:
     if len(networks) == 1 and not text.startswith(f"{networks[0]}="):
         return {networks[0]: text}
     pairs = dict(part.partition("=")[::2] for part in text.split(","))
-    if unknown := [name for name in pairs if name not in networks]:
+    if unknown_names := [name for name in pairs if name not in networks]:
         raise InputError(
-            f"weights: '{unknown[0]}' is not one of {', '.join(networks)}; for several networks use NAME=FILE,NAME=FILE"
+            f"weights: '{unknown_names[0]}' is not one of {', '.join(networks)}; "
+            "for several networks use NAME=FILE,NAME=FILE"
         )
     return pairs

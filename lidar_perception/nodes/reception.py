@@ -191,7 +191,7 @@ class Reception:
     def _on_message(self, data: bytes, info: dict) -> None:
         """Take all messages from the middleware, which would drop some of them without counting."""
         messages = [(data, info), *take_messages(self.subscription, self.kind)]
-        self._accept(messages, one_publisher=len(self.list_publishers()) < 2)
+        self._accept(messages, has_one_publisher=len(self.list_publishers()) < 2)
 
     def _receive(self, message: Any, info: dict) -> None:
         """Queue a message of a link; called in the thread of its publisher."""
@@ -203,9 +203,9 @@ class Reception:
 
     def _take_linked(self) -> None:
         if messages := [self.linked_messages.popleft() for _ in range(len(self.linked_messages))]:
-            self._accept(messages, one_publisher=True)
+            self._accept(messages, has_one_publisher=True)
 
-    def _accept(self, messages: list[tuple[Any, dict]], one_publisher: bool) -> None:
+    def _accept(self, messages: list[tuple[Any, dict]], has_one_publisher: bool) -> None:
         """Count the messages (message, info), keep the newest ones and deliver the oldest of these."""
         self.waiting.extend(message for message, _ in messages)
         # Newer clouds do not replace one that has waited for its pose only briefly. Otherwise no
@@ -217,7 +217,7 @@ class Reception:
             self.waiting.popleft()
             self.waiting_since = self.waiting_since if is_held else None
         self.waiting.extendleft(held_clouds)
-        self.arrivals.add([info for _, info in messages], dropped, one_publisher)
+        self.arrivals.add([info for _, info in messages], dropped, has_one_publisher)
         self._deliver_one()
 
     def _deliver_one(self) -> None:

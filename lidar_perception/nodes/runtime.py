@@ -85,11 +85,11 @@ class LidarNode(Node):
         self.diagnostics.publish()
 
     def _before_set(self, changes: list[Parameter]) -> list[Parameter]:
-        if unknown := [c.name for c in changes if not self.has_parameter(c.name)]:
-            guess = find_closest_name(unknown[0], list_parameter_names(self))
+        if unknown_names := [c.name for c in changes if not self.has_parameter(c.name)]:
+            guess = find_closest_name(unknown_names[0], list_parameter_names(self))
             raise UnknownParameterError(
                 f"{self.get_fully_qualified_name()} has no parameter "
-                f"{unknown[0][:80]!r}" + (f"; did you mean {guess!r}?" if guess else "")
+                f"{unknown_names[0][:80]!r}" + (f"; did you mean {guess!r}?" if guess else "")
             )
         return [convert_to_declared_type(c, self.get_parameter(c.name).type_) for c in changes]
 

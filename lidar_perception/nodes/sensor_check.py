@@ -63,9 +63,9 @@ class SensorCheck:
             self.pose, self.heights = pose, []
         if len(self.heights) < MEASURED_CLOUDS:
             self.heights.append(measure_sensor_height(frame.xyz, pose))
-        measured = [h for h in self.heights if h is not None]
-        if not measured:
+        measured_heights = [h for h in self.heights if h is not None]
+        if not measured_heights:
             return None
-        height = float(np.median(measured))
+        height = float(np.median(measured_heights))
         self.node.diagnostics.counts["sensor_height"] = f"{height:.2f}"
         return find_height_problem(height, pose)

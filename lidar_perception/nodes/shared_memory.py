@@ -36,7 +36,7 @@ def use_large_shared_memory(from_driver: bool = False) -> None:
     except OSError:
         return
     free_bytes = memory.f_bavail * memory.f_frsize
-    profile = next((name for required, name in PROFILES.items() if free_bytes >= required), None)
+    profile = next((name for required_bytes, name in PROFILES.items() if free_bytes >= required_bytes), None)
     if profile != "fastdds.xml":
         print(
             f"/dev/shm has only {free_bytes / 2**20:.0f} MB free, so clouds above "

@@ -59,9 +59,9 @@ class TrackerNode(ManagedNode):
         with self.diagnostics.measure_frame(to_ns(header.stamp)):
             problem = self.tracks.publish(header, to_detections(objects))
         problems = [problem] if problem else []
-        if unknown := find_unknown_classes(objects.labels):
+        if unknown_classes := find_unknown_classes(objects.labels):
             problems.append(
-                f"detections of the unknown classes {', '.join(unknown)[:80]} are tracked as "
+                f"detections of the unknown classes {', '.join(unknown_classes)[:80]} are tracked as "
                 f"Misc; use {', '.join(DETECTED)} as ns of the markers or as class_id"
             )
         self.diagnostics.report(WARN if problems else OK, "; ".join(problems) or "tracking")

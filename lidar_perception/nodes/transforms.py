@@ -80,7 +80,7 @@ class Transforms:
         return bool(self.base_frame or self.target_frame or self.node.node_params.input.deskew != "off")
 
     def subscribe_to_tf(self) -> None:
-        """Subscribe to /tf, in addition to /tf_static, once."""
+        """Subscribe to /tf, in addition to /tf_static, unless already subscribed."""
         if self._has_tf_subscription:
             return
         self._has_tf_subscription = True
@@ -88,7 +88,7 @@ class Transforms:
             self._subscribe(TF, TF_QOS, static=False)
 
     def subscribe_to_odometry(self) -> None:
-        """Subscribe to the odometry, once."""
+        """Subscribe to the odometry unless already subscribed."""
         if not self._has_odometry_subscription:
             self._has_odometry_subscription = True
             self.node.inputs.subscribe("odometry", ODOMETRY_MESSAGE, self.on_odometry, ODOMETRY_QOS)
@@ -106,8 +106,7 @@ class Transforms:
     def on_odometry(self, msg: Any) -> None:
         """Add a nav_msgs/Odometry.
 
-        If sources with different frames share the topic, the first one is used as long as it
-        publishes.
+        If sources with different frames share the topic, only the first one is used until it stops.
         """
         now, child, frame = monotonic(), msg.child_frame_id.lstrip("/"), msg.header.frame_id.lstrip("/")
         if (child, frame) != (self.odometry_child, self.odometry_frame):

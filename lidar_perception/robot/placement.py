@@ -54,18 +54,18 @@ def make_tilted_pose(roll: float, pitch: float, height: float = 0.0) -> np.ndarr
     )
 
 
-def find_level_transform(base: np.ndarray, ahead: float = 0.0) -> np.ndarray | None:
+def find_level_transform(base: np.ndarray, forward_yaw: float = 0.0) -> np.ndarray | None:
     """Compute Placement.level for a base, None if it is the identity.
 
     Args:
         base: (4, 4) pose of the sensor in a frame on the ground.
-        ahead: Forward direction of the detectors, in radians counter-clockwise from the sensor's x.
+        forward_yaw: Forward direction of the detectors, in radians counter-clockwise from the sensor's x.
     """
     roll, pitch = find_roll_pitch(base)
     level = None if max(abs(roll), abs(pitch)) < MIN_TILT_RAD else make_tilted_pose(roll, pitch)
-    if not ahead:
+    if not forward_yaw:
         return level
-    s, c = np.sin(ahead), np.cos(ahead)
+    s, c = np.sin(forward_yaw), np.cos(forward_yaw)
     yaw_rotation = np.eye(4)
     yaw_rotation[:2, :2] = [[c, s], [-s, c]]
     return yaw_rotation if level is None else yaw_rotation @ level

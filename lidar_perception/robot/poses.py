@@ -92,8 +92,8 @@ def transform_boxes(boxes: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
     Boxes stay upright; only their yaw is rotated.
     """
-    transformed = np.array(boxes, np.float64).reshape(-1, 7)
-    heading = pose[:2, :2] @ np.array([np.cos(transformed[:, 6]), np.sin(transformed[:, 6])])
-    transformed[:, :3] = transformed[:, :3] @ pose[:3, :3].T + pose[:3, 3]
-    transformed[:, 6] = wrap_angle(np.arctan2(heading[1], heading[0]))
-    return transformed
+    transformed_boxes = np.array(boxes, np.float64).reshape(-1, 7)
+    heading = pose[:2, :2] @ np.array([np.cos(transformed_boxes[:, 6]), np.sin(transformed_boxes[:, 6])])
+    transformed_boxes[:, :3] = transformed_boxes[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+    transformed_boxes[:, 6] = wrap_angle(np.arctan2(heading[1], heading[0]))
+    return transformed_boxes

@@ -31,7 +31,7 @@ def read_results(path: Path, *topics: str) -> list[list[RecordedResult]]:
         InputError: No transform connects the results with the labels.
     """
     handle = BagHandle(path)
-    objects = read_objects_by_stamp(handle.bag(), (*topics, TRUTH))
+    objects = read_objects_by_stamp(handle.get_bag(), (*topics, TRUTH))
     truth = objects[TRUTH]
     poses = BagPoses(handle, next((labels.frame_id for labels in truth.values()), ""))
     return [

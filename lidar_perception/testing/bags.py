@@ -102,7 +102,7 @@ def copy_bag(source: Path, path: Path, storage: str, names: Mapping[str, str] = 
                 names.get(topic, topic),
                 type_name,
                 typestore=load_typestore(),
-                offered_qos_profiles=source_bag.qos(topic),
+                offered_qos_profiles=source_bag.find_qos(topic),
             )
             for topic, type_name in source_bag.topics.items()
         }
@@ -120,9 +120,9 @@ def to_frames(frames: Sequence[Any] | Iterable[Frame], labels: Any = None, **opt
     frames = list(frames)
     if not frames or not isinstance(frames[0], Frame):
         return make_frames(frames, labels, **options)
-    if rejected := [*(() if labels is None else ("labels",)), *options]:
+    if rejected_options := [*(() if labels is None else ("labels",)), *options]:
         raise InputError(
-            f"frames already have labels, times and a frame_id; leave out {' and '.join(rejected)}, or "
+            f"frames already have labels, times and a frame_id; leave out {' and '.join(rejected_options)}, or "
             "give arrays instead of frames"
         )
     return frames

@@ -145,13 +145,13 @@ def _list_objects(word: str, objects: Objects, rows: Sequence[int], others: Obje
     for i in rows[:MAX_LISTED]:
         box = objects.boxes[i]
         size = "" if np.isnan(box[3]) else " size {:.2f} {:.2f} {:.2f}, yaw {:.2f}".format(*box[3:])
-        nearest = ""
+        nearest_text = ""
         if len(others.boxes):
             j = int(np.argmin(np.nan_to_num(distance[i], nan=np.inf)))
-            nearest = f"; nearest: {others.labels[j]}, {distance[i, j]:.2f} m away"
+            nearest_text = f"; nearest: {others.labels[j]}, {distance[i, j]:.2f} m away"
         score = f", score {objects.scores[i]:.2f}" if word == "extra" else ""
         lines.append(
-            f"  {word}: {objects.labels[i]} at ({box[0]:.2f}, {box[1]:.2f}, {box[2]:.2f}){size}{score}{nearest}"
+            f"  {word}: {objects.labels[i]} at ({box[0]:.2f}, {box[1]:.2f}, {box[2]:.2f}){size}{score}{nearest_text}"
         )
     if len(rows) > MAX_LISTED:
         lines.append(f"  ... and {len(rows) - MAX_LISTED} more {word}")

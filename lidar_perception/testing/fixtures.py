@@ -32,7 +32,7 @@ def domain() -> Iterator[int]:
         yield number
 
 
-def _processes(domain: int, folder: Path) -> Iterator[Any]:
+def _start_processes(domain: int, folder: Path) -> Iterator[Any]:
     pytest.importorskip("rclpy", reason=NEEDS_ROS)
     from lidar_perception.testing.processes import NodesUnderTest
 
@@ -40,7 +40,7 @@ def _processes(domain: int, folder: Path) -> Iterator[Any]:
         yield nodes
 
 
-def _peer(domain: int, processes: Any) -> Iterator[Any]:
+def _start_peer(domain: int, processes: Any) -> Iterator[Any]:
     from lidar_perception.testing.peer import Peer
 
     with Peer(domain, processes) as peer:
@@ -50,25 +50,25 @@ def _peer(domain: int, processes: Any) -> Iterator[Any]:
 @pytest.fixture
 def processes(domain, tmp_path) -> Iterator[Any]:
     """NodesUnderTest object that starts nodes and programs, and stops them at the end of the test."""
-    yield from _processes(domain, tmp_path / "logs")
+    yield from _start_processes(domain, tmp_path / "logs")
 
 
 @pytest.fixture
 def peer(domain, processes) -> Iterator[Any]:
     """Peer object: a node that subscribes, publishes and waits."""
-    yield from _peer(domain, processes)
+    yield from _start_peer(domain, processes)
 
 
 @pytest.fixture(scope="module")
 def shared_processes(domain, tmp_path_factory) -> Iterator[Any]:
     """`processes` shared by all tests of a module, because it takes long to start nodes."""
-    yield from _processes(domain, tmp_path_factory.mktemp("logs"))
+    yield from _start_processes(domain, tmp_path_factory.mktemp("logs"))
 
 
 @pytest.fixture(scope="module")
 def shared_peer(domain, shared_processes) -> Iterator[Any]:
     """`peer` shared by all tests of a module."""
-    yield from _peer(domain, shared_processes)
+    yield from _start_peer(domain, shared_processes)
 
 
 @pytest.fixture(scope="session")

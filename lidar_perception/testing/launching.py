@@ -29,7 +29,7 @@ def include_launch_file(name: str = "detectors", **arguments: Any) -> Any:
         from launch.actions import IncludeLaunchDescription
         from launch.launch_description_sources import PythonLaunchDescriptionSource
     except ModuleNotFoundError as error:
-        raise _missing_package_error(error) from None
+        raise _make_missing_package_error(error) from None
     try:
         share_folder = Path(get_package_share_directory("lidar_perception"))
     except PackageNotFoundError:
@@ -62,14 +62,14 @@ def make_description(*actions: Any) -> Any:
         from launch.launch_description import LaunchDescription
         from launch_testing.actions import ReadyToTest
     except ModuleNotFoundError as error:
-        raise _missing_package_error(error) from None
+        raise _make_missing_package_error(error) from None
     os.environ.update(ROS_DOMAIN_ID=str(reserve_domain()), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
     use_large_shared_memory()
     warm_up()  # compile here, because compilation in a node could take longer than a timeout
     return LaunchDescription([*actions, ReadyToTest()])
 
 
-def _missing_package_error(error: ModuleNotFoundError) -> InputError:
+def _make_missing_package_error(error: ModuleNotFoundError) -> InputError:
     package = str(error.name).partition(".")[0].replace("_", "-")
     return InputError(
         f"{error.name} is not installed; install ros-jazzy-{package}, or use pytest without "

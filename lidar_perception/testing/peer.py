@@ -35,7 +35,7 @@ class Peer(ExternalNode):
     def __init__(self, domain: int | None = None, processes: NodesUnderTest | None = None):
         super().__init__(domain, "peer")
         self.processes = processes
-        self.received: list[tuple[str, list]] = []  # topic and messages of each subscription
+        self.subscriptions: list[tuple[str, list]] = []  # topic and messages of each subscription
 
     def listen(self, topic: str, message_type: str | type, qos: QoSProfile = RELIABLE) -> list:
         """Subscribe to a topic; return a list to which its messages are appended."""
@@ -48,16 +48,16 @@ class Peer(ExternalNode):
         return self._listen(topic, _resolve_type(message_type)[1], bytes, qos)
 
     def _listen(self, topic: str, cls: type, read: Callable[[bytes], Any] | None, qos: QoSProfile) -> list:
-        received: list = []
+        messages: list = []
         self.node.create_subscription(
             cls,
             topic,
-            (lambda data: received.append(read(data))) if read else received.append,
+            (lambda data: messages.append(read(data))) if read else messages.append,
             qos,
             raw=read is not None,
         )
-        self.received.append((self.node.resolve_topic_name(topic), received))
-        return received
+        self.subscriptions.append((self.node.resolve_topic_name(topic), messages))
+        return messages
 
     def advertise(self, topic: str, message_type: str | type, qos: QoSProfile = RELIABLE) -> Any:
         """Create a publisher for send()."""
@@ -174,7 +174,7 @@ class Peer(ExternalNode):
         diagnostics of the node must reach the number of subscribers of this peer plus `others`.
         """
         name = self.node.resolve_topic_name(topic)
-        expected_count = others + sum(name == subscribed for subscribed, _ in self.received)
+        expected_count = others + sum(name == topic_name for topic_name, _ in self.subscriptions)
         self.wait(
             lambda: int(self.get_value(node, f"subscribers of {name}") or 0) >= expected_count,
             f"{expected_count} subscribers of {name}",
@@ -191,7 +191,7 @@ class Peer(ExternalNode):
             f"{topic} {len(messages)} messages"
             if messages
             else f"{topic} no messages from {self.node.count_publishers(topic)} publishers"
-            for topic, messages in self.received
+            for topic, messages in self.subscriptions
         )
         return f"diagnostics: {diagnostics or 'none'}" + (f"; received: {received}" if received else "")
 

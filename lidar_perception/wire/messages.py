@@ -182,7 +182,8 @@ def read_calibration(info: Any, transform: Any) -> Calibration:
     if info.header.frame_id != parent:  # the message has the camera's pose in the LiDAR frame, so invert it
         if info.header.frame_id != child:
             raise InputError(
-                f"CameraInfo is in frame '{info.header.frame_id}', but the transform connects '{parent}' and '{child}'"
+                f"CameraInfo is in frame '{info.header.frame_id}', but the transform connects '{parent}' and "
+                f"'{child}'; publish the transform between the LiDAR and this camera"
             )
         lidar_to_camera = poses.invert_pose(lidar_to_camera)
     return make_calibration(info, lidar_to_camera)

@@ -9,8 +9,8 @@ from lidar_perception.types import InputError
 from msg_utils.stamps import to_ns
 
 TF_MESSAGE, ODOMETRY_MESSAGE = "tf2_msgs/msg/TFMessage", "nav_msgs/msg/Odometry"
-# Frame names in the tree of an odometry. They are the names of the message's fields, because the
-# contents of these fields may be equal or empty.
+# Frame names in a tree of odometry poses: the names of the message fields, because the frame names in the
+# messages may be equal or empty.
 MOVING, FIXED = "child_frame_id", "header.frame_id"
 
 

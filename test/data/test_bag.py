@@ -147,7 +147,7 @@ def test_bag_has_the_requested_compression(tmp_path, compression, pack):
 def test_calibrations_are_latched_and_clouds_are_not(sample_bag):
     with Bag(sample_bag) as bag:
         for topic in bag.topics:
-            (quality,) = bag.qos(topic)
+            (quality,) = bag.find_qos(topic)
             latched = quality.durability.name == "TRANSIENT_LOCAL"
             assert latched == (topic in LATCHED)
             assert quality.reliability.name == "RELIABLE"

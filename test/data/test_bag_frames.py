@@ -73,7 +73,7 @@ def test_cloud_topic_is_chosen_or_the_available_ones_are_listed(tmp_path):
 def test_first_frame_is_read_without_scanning_the_bag(sample_bag, monkeypatch):
     """Scanning an hour of clouds takes minutes, and many commands need only the first one."""
     stamped = []
-    monkeypatch.setattr(bag_frames.BagFrames, "_stamp", lambda self, data, time: stamped.append(time) or time)
+    monkeypatch.setattr(bag_frames.BagFrames, "_find_stamp", lambda self, data, time: stamped.append(time) or time)
     frames = open_recording(sample_bag).frames
     assert frames[0].index == frames[-3].index == 0 and len({*stamped}) == 1
     assert frames[1].index == 1 and len({*stamped}) == 3

@@ -290,14 +290,14 @@ def test_irrelevant_metadata_is_ignored(sample_bag, messages, tmp_path, change):
 def test_qos_in_metadata_takes_precedence(sample_bag, tmp_path, text, durability, depth):
     path = copy_with_metadata(sample_bag, tmp_path / "bag", lambda info: update_topics(info, offered_qos_profiles=text))
     with Bag(path) as bag:
-        (profile,) = bag.qos(POINTS)
+        (profile,) = bag.find_qos(POINTS)
         assert (profile.durability.name, profile.depth) == (durability, depth)
         assert profile.reliability.name == "BEST_EFFORT"
     path = copy_with_metadata(
         sample_bag, tmp_path / "other", lambda info: update_topics(info, offered_qos_profiles="nonsense")
     )
     with Bag(path) as bag:
-        assert bag.qos(EXTRINSICS)[0].durability.name == "TRANSIENT_LOCAL"
+        assert bag.find_qos(EXTRINSICS)[0].durability.name == "TRANSIENT_LOCAL"
 
 
 def set_counts(info, count):

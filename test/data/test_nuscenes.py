@@ -221,7 +221,7 @@ def test_single_line_and_empty_tables_are_read(tmp_path):
     (tmp_path / "v").mkdir()
     for text, rows in ('[{"a":1,"b":"x, ] y"},{"b":2,"a":0}]', [(1, "x, ] y"), (0, 2)]), (" [ ] \n", []):
         (tmp_path / "v/t.json").write_text(text)
-        assert list(Tables(tmp_path, "v").rows("t", "a", "b")) == rows
+        assert list(Tables(tmp_path, "v").read_rows("t", "a", "b")) == rows
 
 
 def test_version_without_labels_has_frames(write_changed_tables):

@@ -70,7 +70,7 @@ def test_ros1_tf_latched_topics_and_unknown_types_are_read(tmp_path):
     with Bag(tmp_path / "old.bag") as bag:
         assert set(bag.topics.values()) == {"tf2_msgs/msg/TFMessage"}
         assert bag.counts == {"/tf": 1, "/tf_static": 1}
-        assert [bool(bag.qos(topic)) for topic in ("/tf", "/tf_static")] == [False, True]
+        assert [bool(bag.find_qos(topic)) for topic in ("/tf", "/tf_static")] == [False, True]
         for _, time, msg in bag.messages(bag.topics):
             assert time == 5 and msg.transforms[0].child_frame_id == "b"
 

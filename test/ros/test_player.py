@@ -333,7 +333,7 @@ def test_recorder_writes_the_played_messages(processes, peer, text_bag, tmp_path
     with Bag(tmp_path / "copy") as bag:
         assert [m.data for _, _, m in bag.messages({"/text"})] == [str(i) for i in range(20)]
         assert [m.data for _, _, m in bag.messages({"/note"})] == ["latched"]
-        assert bag.qos("/note")[0].durability.name == "TRANSIENT_LOCAL"
+        assert bag.find_qos("/note")[0].durability.name == "TRANSIENT_LOCAL"
     with open(tmp_path / "copy/copy.mcap", "rb") as stream:
         assert {c.compression for c in make_reader(stream).get_summary().chunk_indexes} == {"lz4"}
 

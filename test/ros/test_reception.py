@@ -211,7 +211,7 @@ def test_restarted_or_second_driver_loses_no_cloud():
     arrivals = Arrivals(5)
     for number in (7, 8, 1, 2):
         arrivals.add(make_infos([number]), 0)
-    arrivals.add(make_infos([90]), 0, one_publisher=False)
+    arrivals.add(make_infos([90]), 0, has_one_publisher=False)
     arrivals.add(make_infos([99]), 0)  # the first publisher again, alone
     arrivals.add(make_infos([101]), 0)
     assert (arrivals.lost, arrivals.dropped, arrivals.sent) == (1, 0, 8)

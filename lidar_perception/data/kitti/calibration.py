@@ -115,9 +115,9 @@ def check_pose(pose: np.ndarray, path: Path) -> np.ndarray:
 
 def to_homogeneous(matrix: np.ndarray) -> np.ndarray:
     """Extend a matrix (3, 3) or (3, 4) to (4, 4)."""
-    extended = np.eye(4)
-    extended[:3, : matrix.shape[1]] = matrix
-    return extended
+    result = np.eye(4)
+    result[:3, : matrix.shape[1]] = matrix
+    return result
 
 
 def _read_png_size(image: Path | None) -> tuple[int, int] | None:

@@ -73,7 +73,7 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
             "training/velodyne/0000/*.bin (tracking)"
         )
     has_labels = (folder / "label_02").is_dir() or (folder / "label_2").is_dir()
-    missing = (
+    missing_scans = (
         _find_missing_tracking_scans(folder, frames)
         if is_tracking
         else [
@@ -87,26 +87,26 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
         f"KITTI {'tracking data' if is_tracking else OBJECT_DATA}",
         frames,
         frozenset({CAMERA} | ({BOXES} if has_labels else set())),
-        tuple((name, f"{label} has no scan; download it again") for name, label in missing) if scans else (),
+        tuple((name, f"{label} has no scan; download it again") for name, label in missing_scans) if scans else (),
         is_sequential=is_tracking,
     )
 
 
 def _find_missing_tracking_scans(folder: Path, frames: list[Frame]) -> list[tuple[str, str]]:
     scan_keys = {(frame.sequence, frame.index) for frame in frames}
-    missing = []
+    missing_scans = []
     for label in sorted(folder.glob("label_02/*.txt")):
         numbers = {
             int(number)
             for line in read_text(label, noun="the labels").splitlines()
             if (number := line.partition(" ")[0]).isdecimal()
         }
-        missing += [
+        missing_scans += [
             (f"{label.stem}/{number:06}", f"frame {number} of {label}")
             for number in sorted(numbers)
             if (label.stem, number) not in scan_keys
         ]
-    return missing
+    return missing_scans
 
 
 def _make_object_frames(folder: Path, scans: bool) -> list[Frame]:

@@ -47,11 +47,11 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
     """
     root = _find_root(path)
     assert root is not None
-    opened = path.absolute()
+    opened_path = path.absolute()
     drives = sorted(
         data.parents[1]
         for data in (root / SCAN_FOLDER).glob(f"*/{raw.SCAN_FOLDER}")
-        if opened in (*data.parents, root / SCAN_FOLDER)
+        if opened_path in (*data.parents, root / SCAN_FOLDER)
     )
     frames, has_times = raw.make_frames(drives)
     if not frames:

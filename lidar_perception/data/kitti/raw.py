@@ -139,8 +139,8 @@ def _read_numbers(drive: Path, files: Sequence[Path]) -> list[int]:
     if not path.exists():
         return [parse_scan_number(file) for file in files]
     numbers = read_frame_list(path)
-    if unknown := [file.name for file in files if file.stem not in numbers]:
-        raise InputError(f"{path} does not list {unknown[0]}; export the drive again")
+    if unknown_names := [file.name for file in files if file.stem not in numbers]:
+        raise InputError(f"{path} does not list {unknown_names[0]}; export the drive again")
     return [numbers[file.stem] for file in files]
 
 
@@ -181,8 +181,8 @@ def _read_stamps(drive: Path, numbers: Sequence[int], required: bool) -> list[in
     if all(0 <= number < len(lines) and lines[number] for number in numbers):
         stamp_lines = [lines[number] for number in numbers]
     elif len(stamp_lines) != len(numbers):
-        missing = next(n for n in numbers if not (0 <= n < len(lines) and lines[n]))
-        raise InputError(f"{path} has no line for scan {missing} ({len(lines)} lines); download the drive again")
+        missing_number = next(n for n in numbers if not (0 <= n < len(lines) and lines[n]))
+        raise InputError(f"{path} has no line for scan {missing_number} ({len(lines)} lines); download the drive again")
     try:
         return [_parse_stamp(line) for line in stamp_lines]
     except ValueError as error:

@@ -168,8 +168,8 @@ def to_local_boxes(boxes: GlobalBoxes, pose: np.ndarray) -> np.ndarray:
 
 def are_tilted(boxes: GlobalBoxes, pose: np.ndarray) -> np.ndarray:
     """Return (K,) bool: True for boxes that are tilted, which to_local_boxes makes upright."""
-    upright = to_global_boxes(to_local_boxes(boxes, pose), pose)[2]
-    alignment = np.abs((upright * boxes.rotations).sum(axis=1))
+    upright_rotations = to_global_boxes(to_local_boxes(boxes, pose), pose)[2]
+    alignment = np.abs((upright_rotations * boxes.rotations).sum(axis=1))
     return alignment < (1 - 1e-12) * np.linalg.norm(boxes.rotations, axis=1)
 
 
@@ -182,9 +182,9 @@ def to_global_boxes(boxes: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np
     boxes = np.asarray(boxes, np.float64).reshape(-1, 7)
     yaw, zero = boxes[:, 6], np.zeros(len(boxes))
     cos, sin = np.cos(yaw), np.sin(yaw)
-    upright = np.stack([cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1], axis=1)
+    yaw_rotations = np.stack([cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1], axis=1)
     return (
         boxes[:, :3] @ pose[:3, :3].T + pose[:3, 3],
         boxes[:, 3:6].copy(),
-        to_quaternions(pose[:3, :3] @ upright.reshape(-1, 3, 3)),
+        to_quaternions(pose[:3, :3] @ yaw_rotations.reshape(-1, 3, 3)),
     )

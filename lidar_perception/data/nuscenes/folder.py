@@ -99,23 +99,23 @@ def open_nuscenes(root: str | Path, version: str = "v1.0-mini") -> list[Frame]:
     invalid.
     """
     tables = Tables(root, version)
-    names = dict(tables.rows("scene", "token", "name"))
+    names = dict(tables.read_rows("scene", "token", "name"))
     scene_order = {name: i for i, name in enumerate(names.values())}
     samples = sorted(
         (scene_order[names[scene]], time, token)
-        for token, time, scene in tables.rows("sample", "token", "timestamp", "scene_token")
+        for token, time, scene in tables.read_rows("sample", "token", "timestamp", "scene_token")
         if names.get(scene) in scene_order
     )
     if not samples:
         raise InputError(f"{tables.folder} has no key frames; download it again")
     scene_names, times = list(scene_order), {token: time for _, time, token in samples}
     if len(times) < len(samples):
-        raise InputError(f"{tables.path('sample')} has rows with the same token; download it again")
+        raise InputError(f"{tables.get_path('sample')} has rows with the same token; download it again")
     sweeps = _read_sweeps(tables, times)
     mounts = _read_poses(tables, "calibrated_sensor", {mount for _, _, _, mount in sweeps.values()})
     poses = _read_poses(tables, "ego_pose", {pose for _, _, pose, _ in sweeps.values()})
     all_labels = functools.cache(partial(read_labels, tables, times))
-    label_files = tuple(tables.path(name) for name in ("sample_annotation", "calibrated_sensor", "ego_pose"))
+    label_files = tuple(tables.get_path(name) for name in ("sample_annotation", "calibrated_sensor", "ego_pose"))
     frames, counts = [], dict.fromkeys(scene_order.values(), 0)
     for number, (scene, _, token) in enumerate(samples):
         file, time, pose, mount = sweeps[token]
@@ -157,11 +157,13 @@ def _read_sweeps(tables: Tables, times: dict[str, int]) -> dict[str, tuple[str, 
 
     A sweep is (file, time in us, ego pose token, calibration token).
     """
-    sensors = {token for token, channel in tables.rows("sensor", "token", "channel") if channel == LIDAR_CHANNEL}
-    mounts = {token for token, sensor in tables.rows("calibrated_sensor", "token", "sensor_token") if sensor in sensors}
+    sensors = {token for token, channel in tables.read_rows("sensor", "token", "channel") if channel == LIDAR_CHANNEL}
+    mounts = {
+        token for token, sensor in tables.read_rows("calibrated_sensor", "token", "sensor_token") if sensor in sensors
+    }
     sweeps = {
         sample: (file, time, pose, mount)
-        for sample, key, file, time, pose, mount in tables.rows(
+        for sample, key, file, time, pose, mount in tables.read_rows(
             "sample_data",
             "sample_token",
             "is_key_frame",
@@ -172,10 +174,10 @@ def _read_sweeps(tables: Tables, times: dict[str, int]) -> dict[str, tuple[str, 
         )
         if key and mount in mounts and sample in times
     }
-    if missing := times.keys() - sweeps.keys():
+    if missing_tokens := times.keys() - sweeps.keys():
         raise InputError(
-            f"{tables.path('sample_data')} has no {LIDAR_CHANNEL} for {len(missing)} of "
-            f"{len(times)} key frames, such as {min(missing)}; download it again"
+            f"{tables.get_path('sample_data')} has no {LIDAR_CHANNEL} for {len(missing_tokens)} of "
+            f"{len(times)} key frames, such as {min(missing_tokens)}; download it again"
         )
     return sweeps
 
@@ -183,13 +185,16 @@ def _read_sweeps(tables: Tables, times: dict[str, int]) -> dict[str, tuple[str, 
 def _read_poses(tables: Tables, table: str, tokens: set[str]) -> dict[str, np.ndarray]:
     """Return the poses (4, 4) in a table by token: of the sensor in the vehicle's frame, or of the
     vehicle in the global frame."""
-    rows = {token: row for token, *row in tables.rows(table, "token", "translation", "rotation") if token in tokens}
-    if missing := tokens - rows.keys():
+    rows = {
+        token: row for token, *row in tables.read_rows(table, "token", "translation", "rotation") if token in tokens
+    }
+    if missing_tokens := tokens - rows.keys():
         raise InputError(
-            f"{tables.path(table)} has no row {min(missing)} ({len(missing)} missing rows); download it again"
+            f"{tables.get_path(table)} has no row {min(missing_tokens)} ({len(missing_tokens)} missing rows); "
+            "download it again"
         )
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, 3] = tables.numbers(table, "translation", [row[0] for row in rows.values()], 3)
-    quaternions = tables.numbers(table, "rotation", [row[1] for row in rows.values()], 4)
+    poses[:, :3, 3] = tables.convert_numbers(table, "translation", [row[0] for row in rows.values()], 3)
+    quaternions = tables.convert_numbers(table, "rotation", [row[1] for row in rows.values()], 4)
     poses[:, :3, :3] = to_matrices(quaternions)
     return dict(zip(rows, poses))

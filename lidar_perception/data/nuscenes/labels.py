@@ -110,24 +110,24 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
     Raises:
         InputError: a table is invalid.
     """
-    if tables.version.endswith("test") and not tables.path(LABEL_TABLE).exists():
+    if tables.version.endswith("test") and not tables.get_path(LABEL_TABLE).exists():
         return None
     frame_by_token = {token: number for number, token in enumerate(times)}
-    names = dict(tables.rows("category", "token", "name"))
+    names = dict(tables.read_rows("category", "token", "name"))
     category_by_token = {token: number for number, token in enumerate(names)}
     attributes = {
         token: ATTRIBUTES.index(name) if name in ATTRIBUTES else -1
-        for token, name in tables.rows("attribute", "token", "name")
+        for token, name in tables.read_rows("attribute", "token", "name")
     }
     instances = {
         token: (number, category_by_token.get(category, -1))
-        for number, (token, category) in enumerate(tables.rows("instance", "token", "category_token"))
+        for number, (token, category) in enumerate(tables.read_rows("instance", "token", "category_token"))
     }
     label_numbers, links, frame_numbers, object_numbers, category_numbers = (array("q") for _ in range(5))
     tokens: dict[str, int] = {}  # token -> number of the label, in order of first occurrence
     fields = ("translation", "size", "rotation")
     block, blocks = [], []
-    for token, sample, instance, previous_token, next_token, lidar, radar, labels, *box in tables.rows(
+    for token, sample, instance, previous_token, next_token, lidar, radar, labels, *box in tables.read_rows(
         LABEL_TABLE,
         "token",
         "sample_token",
@@ -144,7 +144,7 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
         number, category = instances.get(instance, (-1, -1))
         if category < 0:
             raise InputError(
-                f"{tables.path(LABEL_TABLE)}: the instance {instance} of label {token} is not in "
+                f"{tables.get_path(LABEL_TABLE)}: the instance {instance} of label {token} is not in "
                 "the instance table, or has no category; download the tables again"
             )
         label_numbers.append(tokens.setdefault(token, len(tokens)))
@@ -194,10 +194,10 @@ def _link_neighbours(tables: Tables, tokens: dict[str, int], numbers: array, lin
     row_by_number = np.full(len(tokens) + 1, -1)  # the last element is for the link -1 (no label)
     row_by_number[numbers] = np.arange(len(numbers))
     neighbours = row_by_number[link_pairs]
-    if (missing := (neighbours < 0) & (link_pairs >= 0)).any():
-        token = next(token for token, number in tokens.items() if number == link_pairs[missing][0])
+    if (is_missing := (neighbours < 0) & (link_pairs >= 0)).any():
+        token = next(token for token, number in tokens.items() if number == link_pairs[is_missing][0])
         raise InputError(
-            f"{tables.path(LABEL_TABLE)}: another label links to label {token}, which is missing; download it again"
+            f"{tables.get_path(LABEL_TABLE)}: another label links to label {token}, which is missing; download it again"
         )
     return neighbours
 
@@ -210,7 +210,10 @@ def _to_columns(tables: Tables, block: list[tuple]) -> np.ndarray:
     """
     fields = (("translation", 3), ("size", 3), ("rotation", 4), ("count of points", 3))
     return np.hstack(
-        [tables.numbers(LABEL_TABLE, name, [row[i] for row in block], width) for i, (name, width) in enumerate(fields)]
+        [
+            tables.convert_numbers(LABEL_TABLE, name, [row[i] for row in block], width)
+            for i, (name, width) in enumerate(fields)
+        ]
     )
 
 

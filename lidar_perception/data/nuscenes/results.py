@@ -89,10 +89,10 @@ def read_results(path: Path, frames: Sequence[Frame]) -> dict[str, GlobalBoxes]:
             f"{path} has no 'results'; expected the format of nuScenes' "
             'detection task, {"meta": ..., "results": {sample token: [boxes]}}'
         )
-    if missing := [f for f in frames if f.native.token not in results]:
+    if missing_frames := [f for f in frames if f.native.token not in results]:
         raise InputError(
-            f"{path} has no boxes for {missing[0].name}, sample "
-            f"{missing[0].native.token} (missing: {len(missing)} of {len(frames)} "
+            f"{path} has no boxes for {missing_frames[0].name}, sample "
+            f"{missing_frames[0].native.token} (missing: {len(missing_frames)} of {len(frames)} "
             "frames); add an empty list for a frame without detections, or choose the "
             "scenes to score with --split"
         )

@@ -64,10 +64,10 @@ class Tables:
                 )
             )
 
-    def path(self, table: str) -> Path:
+    def get_path(self, table: str) -> Path:
         return self.folder / f"{table}.json"
 
-    def rows(self, table: str, *fields: str) -> Iterator[tuple]:
+    def read_rows(self, table: str, *fields: str) -> Iterator[tuple]:
         """Yield the values of two or more fields, row by row.
 
         Raises InputError if the table is missing or damaged, or if a field of a row is missing or
@@ -82,19 +82,19 @@ class Tables:
             except (KeyError, TypeError):
                 missing = next(f for f in fields if not isinstance(row, dict) or f not in row)
                 raise InputError(
-                    f"{self.path(table)}: row {number} has no {missing}, so it is not a table of nuScenes; "
+                    f"{self.get_path(table)}: row {number} has no {missing}, so it is not a table of nuScenes; "
                     "download it again"
                 ) from None
             for column, type_ in typed_columns:
                 if not isinstance(values[column], type_) or (type_ is int and not 0 <= values[column] < MAX_TIME_US):
                     raise InputError(
-                        f"{self.path(table)}: row {number}: {fields[column]} is "
+                        f"{self.get_path(table)}: row {number}: {fields[column]} is "
                         f"{PROBLEM_BY_TYPE[type_]}; download it again"
                     )
             yield values
 
     def _decode_rows(self, table: str) -> Iterator[Any]:
-        path, decode = self.path(table), json.JSONDecoder().raw_decode
+        path, decode = self.get_path(table), json.JSONDecoder().raw_decode
         try:
             with open(check_regular(path), encoding="utf-8-sig") as stream:
                 text = stream.read(CHUNK_SIZE).lstrip()
@@ -126,7 +126,7 @@ class Tables:
                 f"{path} is damaged ({shorten_error(error)}); download the tables of {self.version} again"
             ) from None
 
-    def numbers(self, table: str, field: str, values: list, width: int) -> np.ndarray:
+    def convert_numbers(self, table: str, field: str, values: list, width: int) -> np.ndarray:
         """Convert the values of a field to an array (K, width) float64.
 
         Raises InputError unless each value has `width` finite numbers.
@@ -143,5 +143,5 @@ class Tables:
             or (field == "rotation" and not are_valid_rotations(column).all())
         ):
             requirement = "a quaternion" if field == "rotation" else f"{width} finite numbers within {MAX_NUMBER:g}"
-            raise InputError(f"{self.path(table)}: a {field} is not {requirement}; download it again")
+            raise InputError(f"{self.get_path(table)}: a {field} is not {requirement}; download it again")
         return column

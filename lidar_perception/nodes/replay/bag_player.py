@@ -138,14 +138,14 @@ class BagPlayer(LidarNode):
             return self.outputs.advertise(
                 self.names[topic],
                 type_name,
-                _make_qos(self.bag.qos(topic), self._count_latched(topic), lossless=self.follows),
+                _make_qos(self.bag.find_qos(topic), self._count_latched(topic), lossless=self.follows),
             ).publisher
         except (ModuleNotFoundError, AttributeError):
             self.get_logger().warning(f"{topic} is not played: {type_name} is not installed on this machine")
             return None
 
     def _is_latched(self, topic: str) -> bool:
-        return any(q.durability.name == "TRANSIENT_LOCAL" for q in self.bag.qos(topic))
+        return any(q.durability.name == "TRANSIENT_LOCAL" for q in self.bag.find_qos(topic))
 
     def _count_latched(self, topic: str) -> int:
         """Return how many of the last messages of a latched topic are valid: one, or for transforms, which several
@@ -162,8 +162,8 @@ class BagPlayer(LidarNode):
             self._play_once()
             if not self.params.loop:
                 break
-            while not self.stop.done() and (left := begin + MIN_LOOP_S - monotonic()) > 0:
-                self.serve(timeout_sec=left)
+            while not self.stop.done() and (remaining_s := begin + MIN_LOOP_S - monotonic()) > 0:
+                self.serve(timeout_sec=remaining_s)
         self.pace.wait_for_answers(self._serve_answers, self.stop.done)
         self._count_pace()
         self.diagnostics.report(OK, "stopped" if self.stop.done() else "reached the end of the bag")
@@ -298,11 +298,11 @@ class BagPlayer(LidarNode):
                 self.now_ns = stamp
                 self.steps -= topic == self.step_topic
                 return True
-            remaining = (stamp - self.now_ns) / SECOND_NS / self.params.rate
-            is_late = remaining <= 0 and not self.is_paused
+            remaining_s = (stamp - self.now_ns) / SECOND_NS / self.params.rate
+            is_late = remaining_s <= 0 and not self.is_paused
             if is_late and monotonic() - self.last_service < SERVICE_PERIOD_S:
                 return True  # otherwise handle service calls first, however late the replay is
-            wait = 0.05 if self.is_paused else min(max(remaining, 0.0), 0.05)
+            wait = 0.05 if self.is_paused else min(max(remaining_s, 0.0), 0.05)
             if self.clock:
                 wait = min(wait, max(self.next_clock - monotonic(), 0.0))
             self.last_service = monotonic()
@@ -357,7 +357,7 @@ def _fill_response(response: Any, message: str, success: bool = True) -> Any:
 
 
 def _make_qos(profiles: list, latched_count: int, lossless: bool) -> QoSProfile:
-    """Return a profile that matches all subscribers that the recorded publishers matched.
+    """Return a publisher profile that is compatible with the same subscribers as the recorded publishers.
 
     Args:
         profiles: recorded profiles of the publishers; if empty, the result is reliable and volatile.

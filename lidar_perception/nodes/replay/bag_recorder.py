@@ -65,7 +65,7 @@ class BagRecorder(LidarNode):
         if self.failure:
             raise InputError(
                 f"cannot write the bag {self.params.bag}: {self.failure}; the messages written so far are in "
-                f"{self.writer.partial}"
+                f"{self.writer.incomplete_path}"
             )
         types = dict(self.get_topic_names_and_types())
         for topic in [t for t in self.waiting_topics if t in types]:
@@ -184,4 +184,4 @@ class BagRecorder(LidarNode):
         try:
             self.writer.__exit__(type(self.failure) if self.failure else None, self.failure, None)
         except (InputError, OSError) as error:  # the partial file is kept
-            self.get_logger().error(f"{self.writer.partial} is incomplete: {error}")
+            self.get_logger().error(f"{self.writer.incomplete_path} is incomplete: {error}")
