@@ -6,9 +6,11 @@ others occur in labels only. The shapes of simulated objects are in simulation/s
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 Size = tuple[float, float, float]  # (length, width, height) in metres
+UNKNOWN_YAW_RAD = math.pi / math.sqrt(3.0)  # standard deviation of the uniform distribution over the circle
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,8 @@ class DetectionConstants:
             1.72-2.99 and 3.00-6.40 of paper B, Table 2, are rounded; here each extends to the next.
         strict: minimum IoU of a hit in KITTI's benchmark.
         relaxed: lower minimum IoU of a hit, for small objects.
+        deviations: root mean square errors of detected boxes: x and y, z in metres, yaw in radians; 0:
+            unknown. Measured with the fused detector, see docs/reference/messages.md.
     """
 
     anchor: Size
@@ -33,6 +37,7 @@ class DetectionConstants:
     min_diagonal: float
     strict: float
     relaxed: float
+    deviations: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,7 @@ class ObjectClass:
 TABLE = (
     ObjectClass(
         "Car",
-        DetectionConstants((3.9, 1.6, 1.56), 0.6, 0.45, (3.88, 1.63, 1.53), 3.00, 0.7, 0.5),
+        DetectionConstants((3.9, 1.6, 1.56), 0.6, 0.45, (3.88, 1.63, 1.53), 3.00, 0.7, 0.5, (0.19, 0.09, 0.13)),
         vehicle=True,
         aliases=("vehicle", "automobile"),
     ),
@@ -67,14 +72,16 @@ TABLE = (
     ObjectClass("Truck", vehicle=True),
     ObjectClass(
         "Pedestrian",
-        DetectionConstants((0.8, 0.6, 1.73), 0.5, 0.35, (0.84, 0.66, 1.76), 0.40, 0.5, 0.25),
+        DetectionConstants(
+            (0.8, 0.6, 1.73), 0.5, 0.35, (0.84, 0.66, 1.76), 0.40, 0.5, 0.25, (0.13, 0.05, UNKNOWN_YAW_RAD)
+        ),
         motion_model="pedestrian",
         aliases=("person", "people", "human"),
     ),
     ObjectClass("Person_sitting", looks_like="Pedestrian", motion_model="pedestrian"),
     ObjectClass(
         "Cyclist",
-        DetectionConstants((1.76, 0.6, 1.73), 0.5, 0.35, (1.76, 0.60, 1.74), 1.72, 0.5, 0.25),
+        DetectionConstants((1.76, 0.6, 1.73), 0.5, 0.35, (1.76, 0.60, 1.74), 1.72, 0.5, 0.25, (0.12, 0.07, 0.11)),
         motion_model="cyclist",
         aliases=("bicycle", "bicyclist", "rider"),
     ),

@@ -14,7 +14,7 @@ from lidar_perception.detecting.formats import Run
 from lidar_perception.detecting.results import FrameResult
 from lidar_perception.types import Detections, InputError, PointCloud
 from lidar_perception.wire.array_codec import encode_detection_array, encode_markers
-from lidar_perception.wire.messages import make_detection_rows
+from lidar_perception.wire.messages import make_detection_rows, make_pose_covariances
 from lidar_perception.wire.topics import DETECTIONS, TRACKS
 from lidar_perception.wire.track_markers import make_track_rows
 from msg_utils.markers import MarkerRow, list_marker_keys
@@ -70,7 +70,13 @@ class Bag:
         self._write_markers(
             self.detections_topic, stamp_ns, header, make_detection_rows(result.detections, previous_keys)
         )
-        self._write_3d(self.detections_topic, stamp_ns, header, result.detections)
+        self._write_3d(
+            self.detections_topic,
+            stamp_ns,
+            header,
+            result.detections,
+            covariances=make_pose_covariances(result.detections.class_ids),
+        )
         if self.tracks_topic is not None and (tracks := result.tracks) is not None:
             self._write_markers(
                 self.tracks_topic,

@@ -21,7 +21,7 @@ from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.array_codec import encode_detection_array
 from lidar_perception.wire.codec import make_bag_message
-from lidar_perception.wire.messages import make_detection_rows, make_xyz_cloud
+from lidar_perception.wire.messages import make_detection_rows, make_pose_covariances, make_xyz_cloud
 from msg_utils.markers import make_marker_rows
 from msg_utils.messages import load_message_class
 from msg_utils.stamps import make_header, to_ns
@@ -144,7 +144,13 @@ class DetectionOutputs:
         self.markers.publish(header, lambda previous: make_detection_rows(detections, previous, clusters))
         if self.detections_3d is not None and self.detections_3d.get_subscription_count():
             self.detections_3d.publish(
-                encode_detection_array(detections.boxes, detections.labels, detections.scores, header=header)
+                encode_detection_array(
+                    detections.boxes,
+                    detections.labels,
+                    detections.scores,
+                    header=header,
+                    covariances=make_pose_covariances(detections.class_ids),
+                )
             )
         for step, publisher in self.step_times.items():
             if step in ms:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from lidar_perception.classes import UNKNOWN_YAW_RAD
 from lidar_perception.geometry import wrap_angle, wrap_line
 
 X, Y, VX, VY, HEADING, TURN_RATE = range(6)
@@ -155,3 +156,12 @@ def rotate_covariances(covariances: np.ndarray, cos: float, sin: float, side: fl
     for a, b in ((X, Y), (VX, VY)):
         rotation[a, b], rotation[b, a] = -side * sin, sin
     return rotation @ covariances @ rotation.T
+
+
+def forget_headings(covariances: np.ndarray, is_unknown: np.ndarray) -> np.ndarray:
+    """Return the covariances with an unknown heading, without correlations, where is_unknown (N,) is True."""
+    result = covariances.copy()
+    result[is_unknown, HEADING, :] = 0.0
+    result[is_unknown, :, HEADING] = 0.0
+    result[is_unknown, HEADING, HEADING] = UNKNOWN_YAW_RAD**2
+    return result

@@ -92,7 +92,8 @@ class Tracks:
         velocities: (K, 2) m/s over ground along the sensor's x and y axes; without poses, relative
             to the sensor.
         moving: (K,) probability of motion, 0..1.
-        covariances: (K, 6, 6) of [x y vx vy heading turn_rate].
+        covariances: (K, 6, 6) of [x y vx vy heading turn_rate]. The heading of pedestrians that do not
+            walk, or of all pedestrians without poses, is unknown: its variance is pi^2 / 3.
         turn_rates: (K,) rad/s.
         height_variances: (K,) variance of z, m^2.
         seen: (K,) bool, False for tracks that are only predicted in this frame.

@@ -207,9 +207,14 @@ def compute_probabilities(states: States, params: TrackingParams, is_fixed: bool
     )
     if is_fixed:
         fast_probability = compute_moving_probability(states.means, states.covariances, existence_params.walking)
-        fast_probability *= MODEL_IDS[states.class_ids] == MODEL_BY_CLASS_ID[PEDESTRIAN]
+        fast_probability *= find_pedestrians(states)
         validity -= existence_params.faster * np.maximum(2.0 * fast_probability - 1.0, 0.0)
     return existence.to_probability(validity) * existence.to_probability(states.presence)
+
+
+def find_pedestrians(states: States) -> np.ndarray:
+    """Return a mask (N,) of the tracks with the motion model of pedestrians."""
+    return MODEL_IDS[states.class_ids] == MODEL_BY_CLASS_ID[PEDESTRIAN]
 
 
 def compute_moving_probability(means: np.ndarray, covariances: np.ndarray, speed: float) -> np.ndarray:

@@ -14,8 +14,20 @@ from lidar_perception.tracking.ego import Ego, advance_ego, is_jump, is_valid_po
 from lidar_perception.tracking.existence import to_probability
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.state import States, Tracks
-from lidar_perception.tracking.step import compute_probabilities, match, predict, prune, start_tracks, update
+from lidar_perception.tracking.step import (
+    compute_probabilities,
+    find_pedestrians,
+    match,
+    predict,
+    prune,
+    start_tracks,
+    update,
+)
 from lidar_perception.types import CLASSES, MAX_RANGE, Detections, InputError
+
+# Minimum probability of motion of a pedestrian with a known heading. Detectors do not measure the heading of people,
+# so it is known only from their motion over ground.
+MIN_WALKING_PROBABILITY = 0.5
 
 
 class Tracker:
@@ -213,6 +225,8 @@ def _to_sensor_frame(states: States, ego: Ego, seen: np.ndarray, params: Trackin
     cos, sin = (to_sensor[:2, 0] / max(np.hypot(*to_sensor[:2, 0]), 1e-9)).tolist()
     side = -1.0 if to_sensor[2, 2] < 0 else 1.0  # -1 for an upside-down sensor
     covariances = motion.rotate_covariances(published_states.covariances, cos, sin, side)
+    is_walking = (published_states.moving >= MIN_WALKING_PROBABILITY) & ego.has_pose
+    covariances = motion.forget_headings(covariances, find_pedestrians(published_states) & ~is_walking)
     velocities = published_states.means[:, 2:4] @ np.array([[cos, sin], [-side * sin, side * cos]])
     detections = Detections.of(
         transform_boxes(published_states.to_boxes(), to_sensor), published_states.class_ids, scores[indices]

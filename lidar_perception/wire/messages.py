@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.camera import Calibration
-from lidar_perception.classes import ID_BY_ALIAS
+from lidar_perception.classes import ID_BY_ALIAS, TABLE
 from lidar_perception.groups import renumber_ids
 from lidar_perception.intensity import INTENSITY_FIELDS, find_scale_problem, infer_full_scale, to_unit
 from lidar_perception.robot import poses
@@ -31,6 +31,12 @@ from msg_utils.stamps import to_ns
 # Values of the column in_view: segmented, and in view but not segmented because no detector uses the point.
 IN_VIEW, OUT_OF_RANGE = 1, 2
 MAX_ID = 2**31  # marker ids are int32
+DETECTION_COVARIANCES = np.array(  # (C, 6, 6) by class, see make_pose_covariances
+    [
+        np.diag(np.square((xy, xy, z, 0.0, 0.0, yaw)))
+        for xy, z, yaw in (row.numbers.deviations if row.numbers else (0.0, 0.0, 0.0) for row in TABLE)
+    ]
+)
 FullScale = Callable[[np.ndarray, DTypeLike], float]  # see intensity.infer_full_scale
 
 
@@ -307,6 +313,20 @@ def make_detection_rows(
     for text, cluster in zip(texts, () if clusters is None else clusters):
         text["cluster_id"] = int(cluster)
     return make_marker_rows(detections.boxes, labels, detections.scores, extras=texts, previous=previous)
+
+
+def make_pose_covariances(class_ids: np.ndarray) -> np.ndarray:
+    """Make the pose covariances of K detections, from the measured errors of their classes.
+
+    Args:
+        class_ids: (K,) indices into CLASSES.
+
+    Returns:
+        (K, 6, 6) float64 as in geometry_msgs/PoseWithCovariance: x, y, z, roll, pitch, yaw in metres
+        and radians. The entries of roll and pitch are 0, and those of classes without a measurement
+        are all 0.
+    """
+    return DETECTION_COVARIANCES[class_ids]
 
 
 def make_odometry(pose: np.ndarray, header: Any, moving_frame: str, make: Any) -> Any:

@@ -152,12 +152,16 @@ def test_output_bag_has_the_messages_of_the_nodes(drives, tmp_path, monkeypatch,
         assert bag.counts.get(POINTS, 0) == clouds * len(frames)
         for topic in "/made_detector/output/detections", "/tracker/output/tracks":
             marker_objects = read_objects_by_stamp(bag, [topic])[topic]
-            arrays = [from_detection_array(message) for _, _, message in bag.messages([f"{topic}_3d"])]
+            messages = [message for _, _, message in bag.messages([f"{topic}_3d"])]
+            arrays = [from_detection_array(message) for message in messages]
             assert sorted(marker_objects) == stamps == [array.stamp_ns for array in arrays]
             for array in arrays:
                 np.testing.assert_allclose(array.boxes, marker_objects[array.stamp_ns].boxes, atol=1e-9)
                 assert array.labels == marker_objects[array.stamp_ns].labels
                 assert array.ids.tolist() == marker_objects[array.stamp_ns].ids.tolist()
+            for detection in (d for message in messages for d in message.detections):
+                variances = np.diag(detection.results[0].pose.covariance.reshape(6, 6))
+                assert (variances[[0, 1, 2, 5]] > 0).all() and (variances[[3, 4]] == 0).all()
         assert sum(map(len, marker_objects.values())) > 0
 
 

@@ -51,6 +51,23 @@ def test_ids_are_stable_and_velocities_correct():
     assert (last.moving[[0, 1, 2]] > 0.99).all() and last.moving[4] < 0.3
 
 
+def test_heading_of_pedestrians_is_known_only_while_they_walk():
+    """Detectors do not measure the heading of people, so it follows from their motion over ground."""
+    rng = np.random.default_rng(5)
+    frames = []
+    for i in range(30):
+        boxes = np.array([make_person(5 + 0.1 * i, 0.1 * i), make_person(10, -4), make_car(20, 8)])
+        boxes[:2, 6] = rng.uniform(-np.pi, np.pi, 2)
+        frames.append(Detections.of(boxes, [PEDESTRIAN, PEDESTRIAN, CAR], 0.9))
+    last = track(frames, [np.eye(4)] * 30)[-1]
+    walking, standing, parked = last.covariances[:, 4, 4]
+    assert abs(wrap_angle(last.detections.boxes[0, 6] - np.pi / 4)) < 0.2 and walking < 0.3
+    assert standing == pytest.approx(np.pi**2 / 3) and not last.covariances[1, 4, [0, 1, 2, 3, 5]].any()
+    assert parked < 0.1
+    without_poses = track(frames)[-1].covariances[:, 4, 4]
+    assert without_poses[:2] == pytest.approx(np.pi**2 / 3) and without_poses[2] < 0.1
+
+
 @pytest.mark.parametrize("rate", [20, 10, 5, 2])
 def test_fast_car_is_one_track_at_any_rate(rate):
     frames = [make_detections(make_car(-60 + 28.0 * i / rate)) for i in range(20)]

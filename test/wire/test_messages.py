@@ -8,12 +8,14 @@ from marker_messages import make_detection_markers
 from samples import CALIBRATION, each_make, make_any_header
 
 from lidar_perception.camera import Calibration, Camera
+from lidar_perception.classes import CAR, CLASSES, PEDESTRIAN
 from lidar_perception.intensity import find_scale_problem
 from lidar_perception.types import Detections, InputError
 from lidar_perception.wire.codec import decode, encode, make_bag_message
 from lidar_perception.wire.messages import (
     make_camera_info,
     make_extrinsics,
+    make_pose_covariances,
     read_calibration,
     read_column,
     to_point_cloud,
@@ -64,6 +66,15 @@ def test_unusable_camera_raises_input_error(make, change, words):
     change(info, transform)
     with pytest.raises(InputError, match=words):
         read_calibration(info, transform).camera()
+
+
+def test_pose_covariances_of_detections_depend_on_the_class():
+    square = make_pose_covariances(np.array([CAR, PEDESTRIAN, CLASSES.index("Misc")]))
+    assert square.shape == (3, 6, 6) and not square[2].any()  # zero is unknown
+    np.testing.assert_array_equal(square, square * np.eye(6))
+    assert (square[:2, [0, 1, 2, 5], [0, 1, 2, 5]] > 0).all() and not square[:, [3, 4], [3, 4]].any()
+    assert square[1, 5, 5] == pytest.approx(np.pi**2 / 3)  # the heading of people is not measured
+    assert make_pose_covariances(np.zeros(0, np.int32)).shape == (0, 6, 6)
 
 
 def test_point_is_in_view_if_it_projects_into_the_image():
