@@ -15,7 +15,7 @@ from lidar_perception.types import CLASSES, MAX_RANGE, GroundTruth, InputError, 
 
 NO_TRACK = -1
 OTHER_CLASS = "Misc"  # one of CLASSES, used for unknown classes
-MAX_DIFFERENCE = 1e-4  # maximum difference from the box in the file, in metres and radians, of an unchanged box
+MAX_DIFFERENCE = 1e-4  # boxes that differ less from the box in the file (in metres and radians) are unchanged
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ class DriveLabels:
 
     Attributes:
         frames: Labels of each frame, in the order of the frames.
-        extra: Content of files that belongs to the drive and not to a frame, by format.
+        extra: Other content of a label file that belongs to the whole drive, by format.
     """
 
     frames: list[FrameLabels]

@@ -78,7 +78,7 @@ X, Y, HEADING, LENGTH, WIDTH, SPEED, START, STOP = range(8)
 @njit(cache=True, nogil=True)
 def _touches_any(footprint, others, radii, seconds, gap):
     """Return True if a footprint touches any of the others (M, 8), which have the motion radii (M,)."""
-    radius = _motion_radius(footprint, seconds) + gap
+    radius = _compute_motion_radius(footprint, seconds) + gap
     for m in range(len(others)):
         x, y, limit = others[m, X] - footprint[X], others[m, Y] - footprint[Y], radius + radii[m]
         if 0 <= limit and x * x + y * y <= limit * limit and footprints_touch(footprint, others[m], seconds, gap):
@@ -87,7 +87,7 @@ def _touches_any(footprint, others, radii, seconds, gap):
 
 
 @njit(cache=True, nogil=True)
-def _motion_radius(footprint, seconds):
+def _compute_motion_radius(footprint, seconds):
     """Return the radius of a circle around the initial centre that a footprint never leaves, in m."""
     return math.hypot(footprint[LENGTH], footprint[WIDTH]) + footprint[SPEED] * seconds
 
@@ -130,11 +130,11 @@ def footprints_touch(one, other, seconds, gap):
 @njit(cache=True, nogil=True)
 def _compute_offset(one, other, t):
     """Return the vector from the centre of `one` to the centre of `other` at time t."""
-    moved = one[SPEED] * min(max(t - one[START], 0.0), one[STOP] - one[START])
-    other_moved = other[SPEED] * min(max(t - other[START], 0.0), other[STOP] - other[START])
+    distance = one[SPEED] * min(max(t - one[START], 0.0), one[STOP] - one[START])
+    other_distance = other[SPEED] * min(max(t - other[START], 0.0), other[STOP] - other[START])
     return (
-        other[X] + math.cos(other[HEADING]) * other_moved - one[X] - math.cos(one[HEADING]) * moved,
-        other[Y] + math.sin(other[HEADING]) * other_moved - one[Y] - math.sin(one[HEADING]) * moved,
+        other[X] + math.cos(other[HEADING]) * other_distance - one[X] - math.cos(one[HEADING]) * distance,
+        other[Y] + math.sin(other[HEADING]) * other_distance - one[Y] - math.sin(one[HEADING]) * distance,
     )
 
 
@@ -148,8 +148,8 @@ def _touches_trajectory(footprint, trajectory, radius):
     for k in range(len(trajectory)):
         (t, x, y), previous = trajectory[k], trajectory[max(k - 1, 0)]
         step = footprint[SPEED] * (t - previous[0]) + math.hypot(x - previous[1], y - previous[2])
-        moved = footprint[SPEED] * min(max(t - footprint[START], 0.0), footprint[STOP] - footprint[START])
-        x, y = x - footprint[X] - cos * moved, y - footprint[Y] - sin * moved
+        distance = footprint[SPEED] * min(max(t - footprint[START], 0.0), footprint[STOP] - footprint[START])
+        x, y = x - footprint[X] - cos * distance, y - footprint[Y] - sin * distance
         dx, dy = abs(cos * x + sin * y) - footprint[LENGTH], abs(cos * y - sin * x) - footprint[WIDTH]
         if math.hypot(max(dx, 0.0), max(dy, 0.0)) < radius + step / 2:
             return True
@@ -217,17 +217,17 @@ class ActorSet:
             gap: Gap to the other actor, m.
 
         Returns:
-            False if the actor was not added: its place is taken, or no other actor is within the distance.
+            True if the actor was added; False if its place is taken or no other actor is within the distance.
         """
         footprint = actor.footprint.copy()
         step = SLIDE_STEP_M * np.array([cos(direction), sin(direction)])
         others, radii = self._footprints[: self._count], self._radii
-        for moved in range(1 + int(distance / SLIDE_STEP_M)):
+        for step_count in range(1 + int(distance / SLIDE_STEP_M)):
             if _touches_trajectory(footprint, self._path, self._radius + gap):
                 return False
             if _touches_any(footprint, others, radii, self.seconds, 0.0):
                 x, y = footprint[:2] - step * (1 + gap / SLIDE_STEP_M) - actor.footprint[:2]
-                return moved > 0 and self.admit(replace(actor, x=actor.x + x, y=actor.y + y), gap=0.0)
+                return step_count > 0 and self.admit(replace(actor, x=actor.x + x, y=actor.y + y), gap=0.0)
             footprint[:2] += step
         return False
 
@@ -240,5 +240,8 @@ class ActorSet:
     def _append(self, footprint: np.ndarray) -> None:
         if self._count == len(self._footprints):  # double the capacity
             self._footprints, self._radii = np.tile(self._footprints, (2, 1)), np.tile(self._radii, 2)
-        self._footprints[self._count], self._radii[self._count] = footprint, _motion_radius(footprint, self.seconds)
+        self._footprints[self._count], self._radii[self._count] = (
+            footprint,
+            _compute_motion_radius(footprint, self.seconds),
+        )
         self._count += 1

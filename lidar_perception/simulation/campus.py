@@ -91,7 +91,7 @@ CAMPUS_KINDS = {
 def make_campus(
     rng: np.random.Generator, kind: CampusKind, people: float
 ) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
-    """Make the ground, actors and trajectory of a campus scene, with a factor for the number of people."""
+    """Make the ground, actors and trajectory of a campus scene; `people` scales the number of people."""
     trajectory = draw_trajectory(rng, kind.speed, kind.stop_chance, kind.max_heading)
     court = Court.enclose(
         trajectory.sample(DRIVE_SECONDS, 1.0)[:, 1:],

@@ -14,10 +14,10 @@ from lidar_perception.simulation.shapes.scene_object import SceneObject
 
 # Probabilities of groups with 1, 2, ... people.
 STANDING_PROBABILITIES, WALKING_PROBABILITIES = (0.55, 0.3, 0.1, 0.05), (0.62, 0.3, 0.08)
-AT_WALL_RATIO = 0.25  # fraction of groups that is replaced by people at walls
-AT_WALL_TRIES = 0.9  # tries to place a person at a wall of a court per replaced group
+AT_WALL_RATIO = 0.25  # fraction of groups that are replaced by people at walls
+AT_WALL_TRIES = 0.9  # attempts per replaced group to place a person at a wall of a court
 MAX_AT_WALL_M = 4.0  # maximum distance of a wall from the edge of a court
-LEANING_RATIO = 0.35  # people at walls who lean against it
+LEANING_RATIO = 0.35  # fraction of people at walls who lean against them
 CROWD_FACTORS = 0.3, 1.0, 1.0, 2.5  # random factors for the number of people in a court
 WHEELCHAIR_RATIO = 0.06  # wheelchairs per walking or standing group
 
@@ -48,7 +48,7 @@ def place_standing(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
         ]
 
 
-def stand_at_walls(
+def place_at_walls(
     rng, actors: ActorSet, side: Side, rate: float, offsets: tuple[float, float], distance: float, turn: float
 ) -> None:
     """Add people next to the objects along a line: walls, shop fronts, fences, hedges, shelves, parked vehicles.
@@ -56,10 +56,8 @@ def stand_at_walls(
     Some lean against it. The others are up to 1 m away and look at it, away from it or along it.
 
     Args:
-        rng: Random generator.
-        actors: Actors of the scene, to which people are added.
         side: The line.
-        rate: Mean number of tries per 100 m.
+        rate: Mean number of attempts per 100 m.
         offsets: Range of distances from the line at which the search begins, m.
         distance: Maximum length of the search beyond the line, m.
         turn: Direction of the search relative to the line, rad: pi / 2 for left, -pi / 2 for right.
@@ -77,8 +75,6 @@ def place_walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Act
     """Yield people who walk along a sidewalk, alone or in groups; some start or stop on the way.
 
     Args:
-        rng: Random generator.
-        side: The sidewalk.
         rate: Groups per 100 m.
         roam: True if people also walk on the road, and in any direction.
     """
@@ -101,8 +97,6 @@ def place_strolling(rng, court: Court, rate: float) -> Iterator[list[Actor]]:
     """Yield groups who walk across a court in any direction; half of them start or stop on the way.
 
     Args:
-        rng: Random generator.
-        court: The court.
         rate: Groups per 100 square metres.
     """
     for x, y in court.draw_positions(rng, rate):
@@ -141,9 +135,6 @@ def fill_court(
     """Add pedestrians and people in wheelchairs to a court.
 
     Args:
-        rng: Random generator.
-        actors: Actors of the scene, to which people are added.
-        court: The court.
         people: Factor for all numbers, which are also multiplied by one of CROWD_FACTORS.
         walkers: Groups who walk along x, per 100 m.
         strollers: Groups who walk in any direction, per 100 square metres.
@@ -154,7 +145,7 @@ def fill_court(
     groups_at_walls = ((walkers + standers) + strollers * floor.sidewalk_width) * floor.length / 100
     rate = AT_WALL_RATIO * AT_WALL_TRIES * groups_at_walls * people / sum(side.length for side in sides) * 100
     for side, depth in zip(sides, (floor.sidewalk_width, floor.length) * 2):
-        stand_at_walls(rng, actors, side, rate, (-depth / 2, -0.3), MAX_AT_WALL_M, np.pi / 2)
+        place_at_walls(rng, actors, side, rate, (-depth / 2, -0.3), MAX_AT_WALL_M, np.pi / 2)
     people *= 1 - AT_WALL_RATIO
     for groups in (
         place_standing(rng, court.floor, standers * people),

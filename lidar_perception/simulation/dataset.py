@@ -17,7 +17,7 @@ from lidar_perception.data.kitti import write as write_kitti
 from lidar_perception.runs.processes import run_in_processes
 from lidar_perception.runs.resumable_folder import finish_frame
 from lidar_perception.simulation.camera import FORWARD_CAMERA, make_kitti_labels
-from lidar_perception.simulation.drive import SimulatedScan, count_drive_scans, simulate_scan
+from lidar_perception.simulation.drive import count_drive_scans, simulate_scan
 from lidar_perception.simulation.scene import ALL_STREETS, Scenes
 from lidar_perception.simulation.sensor import Sensor
 from lidar_perception.types import InputError
@@ -59,62 +59,33 @@ class DatasetPlan:
 
 
 def write_frame(folder: Path, plan: DatasetPlan, number: int) -> int:
-    """Simulate a frame, write its files, and return its number.
-
-    Raises:
-        InputError: A file cannot be written.
-    """
+    """Simulate a frame, write its files, and return its number. Raise InputError if a file cannot be written."""
     sequence, scan_index = divmod(number, plan.frames_per_drive)
     scan = simulate_scan(plan.seed + sequence, scan_index, plan.sensor, plan.scenes)
     order = np.argsort(scan.ring, kind="stable")  # beam by beam, as in KITTI's files
     cloud = scan.frame.points()[order]
-    if plan.layout == "semantickitti":
-        shared_files = _write_semantickitti(folder, plan, sequence, scan_index, scan, cloud, order)
+    shared_files = {}  # text that this frame adds to the files of its drive, by path
+    if plan.layout == "kitti":
+        write_kitti.write_object(folder, number, cloud, make_kitti_labels(scan.truth), FORWARD_CAMERA)
+    elif plan.layout == "kitti-tracking":
+        name = f"{sequence:04}"
+        write_kitti.write_velodyne(folder / f"training/velodyne/{name}/{scan_index:06}.bin", cloud)
+        labels = write_kitti.format_tracking_labels(scan_index, make_kitti_labels(scan.truth), FORWARD_CAMERA)
+        shared_files[f"training/label_02/{name}.txt"] = labels
+        if scan_index == 0:
+            shared_files[f"training/calib/{name}.txt"] = write_kitti.format_calibration(FORWARD_CAMERA)
     else:
-        truth = make_kitti_labels(scan.truth)
-        if plan.layout == "kitti":
-            write_kitti.write_object(folder, number, cloud, truth, FORWARD_CAMERA)
-            shared_files = {}
-        else:
-            name = f"{sequence:04}"
-            write_kitti.write_velodyne(folder / f"training/velodyne/{name}/{scan_index:06}.bin", cloud)
-            shared_files = {
-                f"training/label_02/{name}.txt": write_kitti.format_tracking_labels(scan_index, truth, FORWARD_CAMERA)
-            }
-            if scan_index == 0:
-                calibration = write_kitti.format_calibration(FORWARD_CAMERA)
-                shared_files[f"training/calib/{name}.txt"] = calibration
+        digits = max(2, len(str((plan.frames - 1) // plan.frames_per_drive)))
+        name = f"sequences/{sequence:0{digits}}"
+        semantickitti.write_scan(folder / name, scan_index, cloud, scan.semantic[order], scan.instance[order])
+        shared_files[f"{name}/poses.txt"] = semantickitti.format_pose(scan.pose, FORWARD_CAMERA)
+        shared_files[f"{name}/times.txt"] = f"{scan_index / plan.sensor.rate:.6e}\n"
+        if scan_index == 0:
+            shared_files[f"{name}/calib.txt"] = semantickitti.format_calibration(FORWARD_CAMERA)
     finish_frame(folder, number, shared_files)
     return number
 
 
-def _write_semantickitti(
-    folder: Path,
-    plan: DatasetPlan,
-    sequence: int,
-    scan_index: int,
-    scan: SimulatedScan,
-    cloud: np.ndarray,
-    order: np.ndarray,
-) -> dict[str, str]:
-    digits = max(2, len(str((plan.frames - 1) // plan.frames_per_drive)))
-    name = f"sequences/{sequence:0{digits}}"
-    semantickitti.write_scan(folder / name, scan_index, cloud, scan.semantic[order], scan.instance[order])
-    shared_files = {
-        f"{name}/poses.txt": semantickitti.format_pose(scan.pose, FORWARD_CAMERA),
-        f"{name}/times.txt": f"{scan_index / plan.sensor.rate:.6e}\n",
-    }
-    if scan_index == 0:
-        shared_files[f"{name}/calib.txt"] = semantickitti.format_calibration(FORWARD_CAMERA)
-    return shared_files
-
-
 def write_frames(folder: Path, plan: DatasetPlan, numbers: list[int], jobs: int) -> Generator[int]:
-    """Write frames in several processes, and yield the number of each written frame.
-
-    The processes end when the iterator is closed.
-
-    Raises:
-        InputError: A process failed.
-    """
+    """Write frames in several processes, which end with the iterator, and yield the number of each written frame."""
     return run_in_processes(partial(partial, write_frame, folder, plan), numbers, jobs, "wrote frames")

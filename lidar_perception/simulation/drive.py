@@ -51,11 +51,6 @@ def count_drive_scans(sensor: Sensor) -> int:
     return int(DRIVE_SECONDS * sensor.rate)
 
 
-def choose_scan_index(i: int, count: int, sensor: Sensor) -> int:
-    """Return the index of scan i of `count` scans that are spread evenly over a drive."""
-    return i * count_drive_scans(sensor) // count
-
-
 def simulate_drive(
     seed: int = 0, frames: int = 40, sensor: Sensor = HDL64E, scenes: Scenes = ALL_STREETS
 ) -> Iterator[SimulatedScan]:

@@ -110,7 +110,7 @@ OBJECTS = (*interiors.PERSON_SIZED, furniture.make_planter, furniture.make_litte
 def make_interior(
     rng: np.random.Generator, kind: IndoorKind, people: float
 ) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
-    """Make the ground, actors and trajectory of an interior, with a factor for the number of people."""
+    """Make the ground, actors and trajectory of an interior; `people` scales the number of people."""
     trajectory = draw_trajectory(rng, kind.speed, kind.stop_chance, kind.max_heading)
     actors = ActorSet(DRIVE_SECONDS, trajectory=trajectory, radius=ROBOT_RADIUS_M)
     court = Court.enclose(

@@ -106,7 +106,6 @@ def place_along(rng: np.random.Generator, side: Side, makers: Sequence[Callable]
     """Yield random objects that stand with their backs against a side.
 
     Args:
-        rng: Random generator.
         side: The side; the objects are on its right.
         makers: Functions (rng) that make parts (P,) PART.
         rate: Mean number of objects per 100 m.

@@ -35,7 +35,6 @@ class SimulatedFrames(ComputedFrames):
         Args:
             seed: Seed of the first scene; the next scene has seed + 1.
             frames: Number of frames.
-            sensor: The sensor.
             frames_per_drive: Number of frames of each scene; None uses the full drive.
             scenes: Types of the scenes.
         """

@@ -16,10 +16,8 @@ from lidar_perception.simulation.solids import RETROREFLECTOR
 # scans). Neighbouring returns are lost together: in SemanticKITTI, only 0.03 of the returns from the
 # road beyond 35 m are lost singly.
 GRAZING_EXPONENT = 1 / 3
-POWER_SCATTER, SCATTER_COLUMNS = (
-    0.5,
-    16,
-)  # standard deviation of the log power, and number of adjacent columns with the same error
+POWER_SCATTER = 0.5  # standard deviation of the log power
+SCATTER_COLUMNS = 16  # number of adjacent columns with the same error of the log power
 INTENSITY_NOISE = 0.035  # SemanticKITTI has 0.03 on roads and sidewalks, and 0.04 on facades
 
 
@@ -53,9 +51,6 @@ def make_returns(
 
     Args:
         hits: First hits of all rays.
-        sensor: The sensor.
-        motion: Motion of the sensor.
-        rng: Random generator.
         compensated: Apply motion correction, as in KITTI: points are in the sensor's frame at the
             stamp. Otherwise each point is in the sensor's frame at its own time.
     """

@@ -25,7 +25,7 @@ from lidar_perception.simulation.traffic import populate
 from lidar_perception.simulation.trajectory import DRIVE_SECONDS, Trajectory
 from lidar_perception.types import CLASSES, InputError, suggest_name
 
-MAX_PEOPLE = 100  # maximum factor for the number of people, with which a street takes 3 s to make
+MAX_PEOPLE = 100  # maximum factor for the number of people; making such a street takes 3 s
 EGO_HALF_SIZE_M = (3.0, 1.1)  # half length and half width of the area kept clear for the ego vehicle
 
 
@@ -33,7 +33,7 @@ class Scenes(NamedTuple):
     """Selection of scenes, see make_scene.
 
     Attributes:
-        kind: Kind of the scene type, such as "city"; None for all kinds.
+        kind: Kind of street, campus or interior, such as "city"; None for all kinds.
         people: Factor for the usual number of people.
         scene: One of SCENE_TYPES, or several separated by commas, which alternate with the seed.
     """
@@ -43,19 +43,15 @@ class Scenes(NamedTuple):
     scene: str = "street"
 
     def scene_types(self) -> list[SceneType]:
-        """Return the selected scene types.
-
-        Raises:
-            InputError: An attribute is invalid.
-        """
+        """Return the selected scene types. Raise InputError if an attribute is invalid."""
         if not 0 <= self.people <= MAX_PEOPLE:
             raise InputError(f"people = {self.people} must be between 0 and {MAX_PEOPLE}; the default is 1")
         names = self.scene.split(",")
-        if unknown := [name for name in names if name not in SCENE_TYPES]:
+        if unknown_names := [name for name in names if name not in SCENE_TYPES]:
             raise InputError(
-                f"unknown scene {unknown[0]!r}: must be one of "
+                f"unknown scene {unknown_names[0]!r}: must be one of "
                 f"{', '.join(SCENE_TYPES)}, or several separated by commas"
-                f"{suggest_name(unknown[0], SCENE_TYPES)}"
+                f"{suggest_name(unknown_names[0], SCENE_TYPES)}"
             )
         for name in names:
             if self.kind is not None and self.kind not in SCENE_TYPES[name].kinds:
@@ -122,7 +118,7 @@ class Scene:
         ground: The ground.
         actors: All actors. Labelled ones have the track ids 1, 2, ... in this order.
         trajectory: Trajectory of the sensor.
-        kind: Kind of the scene type.
+        kind: Kind of street, campus or interior, such as "city".
         seconds: Duration of the drive.
     """
 
@@ -145,28 +141,28 @@ class Scene:
         point, pose = self.trajectory.evaluate(t), self.compute_sensor_pose(t, sensor_height)
         sensor_position, rotation = pose[:3, 3].copy(), pose[:3, :3]
         a = self._actor_table
-        travelled = a["speed"] * np.clip(t - a["start"], 0.0, a["stop"] - a["start"])
-        xy = a["xy"] + a["forward"] * travelled[:, None]
+        distances = a["speed"] * np.clip(t - a["start"], 0.0, a["stop"] - a["start"])
+        xy = a["xy"] + a["forward"] * distances[:, None]
         in_sight = np.flatnonzero(np.hypot(*(xy - sensor_position[:2]).T) <= a["sight"])
-        a, travelled, xy = a[in_sight], travelled[in_sight], xy[in_sight]
+        a, distances, xy = a[in_sight], distances[in_sight], xy[in_sight]
         feet = np.where(np.isnan(a["feet"]), compute_ground_height(self.ground, *xy.T), a["feet"])
         position = (np.column_stack([xy, feet]) - sensor_position) @ rotation
         heading = a["heading"] - point.heading
         speed = np.where((a["start"] <= t) & (t < a["stop"]), a["speed"], 0.0)
         velocity = self._add_vertical_velocity(a["forward"] * speed[:, None]) @ rotation
 
-        parts = [self.actors[i].obj.parts(s) for i, s in zip(in_sight.tolist(), travelled.tolist())]
+        parts = [self.actors[i].obj.parts(s) for i, s in zip(in_sight.tolist(), distances.tolist())]
         owner = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
         solids = place_parts(_join_parts(parts), position[owner], heading[owner], a["track"][owner], velocity[owner])
 
-        labelled = np.flatnonzero(a["track"])
-        boxes = np.column_stack([position, a["size"], heading])[labelled]
+        labelled_indices = np.flatnonzero(a["track"])
+        boxes = np.column_stack([position, a["size"], heading])[labelled_indices]
         boxes[:, 2] += boxes[:, 5] / 2
         sensor_velocity = (self._add_vertical_velocity(np.array([point.velocity])) @ rotation)[0]
         motion = Motion(tuple(sensor_velocity.tolist()), point.yaw_rate)
-        a = a[labelled]
+        a = a[labelled_indices]
         return SceneState(
-            solids, sensor_position, point.heading, boxes, a["class"], a["track"], speed[labelled], motion
+            solids, sensor_position, point.heading, boxes, a["class"], a["track"], speed[labelled_indices], motion
         )
 
     @cached_property
@@ -186,10 +182,10 @@ class Scene:
         is_labelled = table["class"] >= 0
         table["track"] = np.where(is_labelled, np.cumsum(is_labelled), 0)
         table["feet"] = np.nan
-        fixed = np.flatnonzero((table["speed"] == 0) & ~is_labelled)
-        footprints = np.array([self.actors[i].footprint for i in fixed]).reshape(-1, 8)
+        fixed_indices = np.flatnonzero((table["speed"] == 0) & ~is_labelled)
+        footprints = np.array([self.actors[i].footprint for i in fixed_indices]).reshape(-1, 8)
         corners = _compute_corners(footprints)
-        table["feet"][fixed] = compute_ground_height(self.ground, *corners).min(axis=1)
+        table["feet"][fixed_indices] = compute_ground_height(self.ground, *corners).min(axis=1)
         return table
 
     def _add_vertical_velocity(self, velocity: np.ndarray) -> np.ndarray:
@@ -223,7 +219,7 @@ def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0, scen
 
     Args:
         seed: Seed, 0 or more.
-        kind: Kind of the scene type, such as "city"; None draws one.
+        kind: Kind of street, campus or interior, such as "city"; None draws one.
         people: Factor for the usual number of pedestrians, sitting people and cyclists. Streets with
             a factor of 1 are similar to KITTI.
         scene: See Scenes.

@@ -254,10 +254,12 @@ def load_sensor(path: str | Path) -> Sensor:
         raise InputError(f"{path} does not describe a sensor; {remedy}")
     values = {key: value for key, value in content.items() if key != "name"}
     field_names = {field.name for field in fields(Sensor)}
-    if unknown := [key for key in values if key not in field_names]:
-        raise InputError(f"{path}: unknown field {unknown[0]!r}; choose from name, {', '.join(sorted(field_names))}")
-    if missing := [key for key in ("elevations", "azimuth_step", "rate") if key not in values]:
-        raise InputError(f"{path}: {missing[0]} is missing; {remedy}")
+    for key in values:
+        if key not in field_names:
+            raise InputError(f"{path}: unknown field {key!r}; choose from name, {', '.join(sorted(field_names))}")
+    for key in ("elevations", "azimuth_step", "rate"):
+        if key not in values:
+            raise InputError(f"{path}: {key} is missing; {remedy}")
     try:
         return Sensor(**{key: _convert_field(key, value) for key, value in values.items()})
     except InputError as error:
@@ -270,11 +272,7 @@ DEGREE_FIELDS = ("elevations", "azimuth_step", "divergence", "wander")
 
 
 def _convert_field(key: str, value: Any) -> Any:
-    """Convert a value of a sensor file to the type and unit of the Sensor field.
-
-    Raises:
-        InputError: The value has the wrong type or shape.
-    """
+    """Convert a value of a sensor file to the type and unit of its field. Raise InputError if that is impossible."""
     shape = FIELD_SHAPES.get(key, ())
     if value == [] and shape[:1] == (0,):
         return ()
@@ -286,22 +284,15 @@ def _convert_field(key: str, value: Any) -> Any:
         numbers.ndim != len(shape)
         or any(n not in (0, m) for n, m in zip(shape, numbers.shape))
         or (np.isnan(numbers).any())
-        or (len(shape) == 2 and not _are_integers(numbers[:, 0]))
+        or (len(shape) == 2 and (~np.isfinite(numbers[:, 0]) | (numbers[:, 0] != np.floor(numbers[:, 0]))).any())
     ):
-        expected = (
-            "a number"
-            if not shape
-            else "a list of " + (f"{shape[0] or ''} numbers".strip() if len(shape) == 1 else "[ring, from, to]")
-        )
-        raise InputError(f"{key} = {reprlib.repr(value)[:60]} must be {expected}")
+        length = f"{shape[0]} " if any(shape) else ""
+        form = ("a number", f"a list of {length}numbers", "a list of [ring, from, to]")[len(shape)]
+        raise InputError(f"{key} = {reprlib.repr(value)[:60]} must be {form}")
     rows = (np.radians(numbers) if key in DEGREE_FIELDS else numbers).tolist()
     if not shape:
         return rows
     return tuple((int(row[0]), *row[1:]) for row in rows) if len(shape) == 2 else tuple(rows)
-
-
-def _are_integers(numbers: np.ndarray) -> bool:
-    return bool(np.isfinite(numbers).all() and (numbers == np.floor(numbers)).all())
 
 
 def _normalize_name(name: str) -> str:
@@ -309,9 +300,8 @@ def _normalize_name(name: str) -> str:
     return "".join(c for c in name.lower() if c.isalnum())
 
 
-PRESET_FILES = {
-    _normalize_name(path.stem): path for path in sorted((Path(__file__).parent / "sensors").glob("*.yaml"))
-}  # normalized name -> sensor file
+# Sensor file of each preset, by normalized name.
+PRESET_FILES = {_normalize_name(path.stem): path for path in sorted((Path(__file__).parent / "sensors").glob("*.yaml"))}
 
 
 @cache
@@ -320,9 +310,7 @@ def _load_preset(key: str) -> Sensor:
 
 
 HDL64E = _load_preset("hdl64e")
-SENSORS: dict[str, Sensor] = {
-    "hdl64e": HDL64E
-}  # presets that are already loaded; others are loaded from PRESET_FILES on demand
+SENSORS: dict[str, Sensor] = {"hdl64e": HDL64E}  # loaded presets; others are loaded from PRESET_FILES on demand
 SENSOR_NAMES = tuple(path.stem for path in PRESET_FILES.values())
 GENERIC_FORMAT = "generic:BEAMS,LOWEST,HIGHEST,STEP,RATE (degrees, revolutions per second)"
 

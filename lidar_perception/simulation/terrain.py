@@ -24,7 +24,7 @@ BARE_FRACTION = 0.45  # approximate fraction of the ground between the patches
 PATCH_STEEPNESS = 3.0  # slope of the edges of patches
 BARE_HEIGHT_RATIO = 0.1  # height of bumps between patches, relative to bumps in patches
 ROAD_HEIGHT_RATIO = 0.06  # height of bumps on the road, relative to bumps in patches
-MAX_TUFT_DISTANCE_M, TUFT_STEPS = 6.0, 8  # last part of a ray that is searched for tufts, and number of search steps
+MAX_TUFT_DISTANCE_M, TUFT_STEPS = 6.0, 8  # length of the end of a ray that is searched for tufts, and search steps
 
 
 class Ground(NamedTuple):
@@ -108,10 +108,9 @@ def _compute_heights(ground, x, y):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cast_ground(ground, start, direction, max_range):
-    """Intersect a ray that starts above the road with the ground.
+    """Intersect a ray that starts above the road with a ground from compile_ground.
 
     Args:
-        ground: Result of compile_ground.
         start, direction: Origin and direction (x, y, z) of the ray in the world.
         max_range: Maximum range, m.
     """
@@ -120,11 +119,11 @@ def cast_ground(ground, start, direction, max_range):
         return no_hit
     t, curb_cosine = _intersect_relief(ground, start, direction, 0.0, 0.0, max_range), 0.0
     if ground.curb_height and not (t <= max_range and _stays_on_road(ground, start, direction, t)):
-        t, curb_cosine = _intersect_raised(ground, start, direction, t, max_range)
+        t, curb_cosine = _intersect_sidewalks_and_curbs(ground, start, direction, t, max_range)
     if not t <= max_range:
         return no_hit
-    cosine = curb_cosine  # replaced if the ray hits a curb
-    if not curb_cosine:
+    cosine = curb_cosine
+    if not curb_cosine:  # the ray does not hit a curb
         _, slope_x, slope_y = _evaluate_relief(ground, start[0] + t * direction[0], start[1] + t * direction[1])
         cosine = min(max(slope_x * direction[0] + slope_y * direction[1] - direction[2], 1e-3), 1.0)
         if ground.tuft_height or ground.litter_height:
@@ -209,11 +208,10 @@ def _intersect_relief(ground, start, direction, lift, t, max_range):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _intersect_raised(ground, start, direction, road_range, max_range):
+def _intersect_sidewalks_and_curbs(ground, start, direction, road_range, max_range):
     """Intersect a ray with sidewalks and curbs.
 
     Args:
-        ground: Result of compile_ground.
         start, direction: Origin and direction (x, y, z) of the ray in the world.
         road_range: Range at which the ray hits the relief without curbs, m.
         max_range: Maximum range, m.

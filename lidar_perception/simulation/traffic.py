@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from lidar_perception.simulation.actors import SIGHT_M, Actor, ActorSet
-from lidar_perception.simulation.crowd import AT_WALL_RATIO, place_bench, place_standing, place_walking, stand_at_walls
+from lidar_perception.simulation.crowd import AT_WALL_RATIO, place_at_walls, place_bench, place_standing, place_walking
 from lidar_perception.simulation.places import Side, draw_positions_along
 from lidar_perception.simulation.shapes.cyclists import make_bicycle, make_cyclist, make_motorcycle, make_motorcyclist
 from lidar_perception.simulation.shapes.heavy_vehicles import make_bus, make_tram, make_truck
@@ -22,8 +22,8 @@ DRAWBAR_M = 0.8  # gap between a car and its trailer
 FREE_CORNER_M = 5.0  # distance from a crossing to the first parked vehicle
 OTHER_VEHICLE = 20  # SemanticKITTI class
 MAX_AT_WALL_M = 8.0  # maximum distance of a wall, fence or hedge from the curb
-AT_WALL_TRIES = 0.4  # tries to place a person at a wall per replaced group, most of which would find no place
-AT_CAR_RATIO = 0.3  # tries to place people next to parked vehicles, per try next to walls
+AT_WALL_TRIES = 0.4  # attempts per replaced group to place a person at a wall; most attempts find no place
+AT_CAR_RATIO = 0.3  # attempts to place people next to parked vehicles, per attempt next to walls
 MOTORCYCLIST_FRACTION = 0.3  # motorcyclists among the riders at the edges of the road
 
 
@@ -31,9 +31,6 @@ def populate(rng: np.random.Generator, street: Street, actors: ActorSet, people:
     """Add the labelled actors of a street, and parked bicycles and motorcycles.
 
     Args:
-        rng: Random generator.
-        street: The street.
-        actors: Actors of the scene, to which the new ones are added.
         people: Factor for the number of people.
     """
     kind, blocks = street.kind, street.blocks
@@ -49,11 +46,11 @@ def populate(rng: np.random.Generator, street: Street, actors: ActorSet, people:
             if actors.admit(seat, gap=0.4):
                 actors.add(*sitters)
     actors.admit_each(_place_riders(rng, street, actors.seconds, people), gap=0.3)
-    tries = AT_WALL_RATIO * AT_WALL_TRIES * (kind.walkers + kind.standers) * people
+    rate = AT_WALL_RATIO * AT_WALL_TRIES * (kind.walkers + kind.standers) * people
     for side in blocks:
-        stand_at_walls(rng, actors, side, tries, (0.3, max(side.sidewalk_width, 0.5)), MAX_AT_WALL_M, np.pi / 2)
+        place_at_walls(rng, actors, side, rate, (0.3, max(side.sidewalk_width, 0.5)), MAX_AT_WALL_M, np.pi / 2)
         if side.parking_width:
-            stand_at_walls(rng, actors, side, AT_CAR_RATIO * tries, (0.6, 1.5), 1.0, -np.pi / 2)
+            place_at_walls(rng, actors, side, AT_CAR_RATIO * rate, (0.6, 1.5), 1.0, -np.pi / 2)
     people *= 1 - AT_WALL_RATIO
     for side in blocks:
         for group in place_standing(rng, side, kind.standers * people):
@@ -146,8 +143,6 @@ def _park_vehicles(rng, side: Side, occupancy: float) -> Iterator[Actor]:
     """Yield parked vehicles: along the curb, in driveways, and in car parks behind the sidewalk.
 
     Args:
-        rng: Random generator.
-        side: The curb.
         occupancy: Fraction of the parking spaces that are occupied.
     """
 

@@ -64,9 +64,6 @@ def draw_trajectory(
     """Draw a trajectory of a robot that stands still, or weaves with periods of 8 to 25 s.
 
     Args:
-        rng: Random generator.
-        speed_range: Minimum and maximum speed, m/s.
-        stop_chance: Probability that the robot stands still.
         max_heading: Maximum deviation of the heading from x, rad.
     """
     if rng.random() < stop_chance:

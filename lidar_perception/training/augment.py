@@ -255,7 +255,7 @@ def move_objects(scene: TrainingScene, max_angle: float, shift: float, rng: np.r
 def move_with_box(xyz: np.ndarray, box: np.ndarray, goal: np.ndarray) -> np.ndarray:
     """Move the points (N, 3) of a box (7,) to the pose of another box, goal (7,). Return float32."""
     relative = to_box_frame(xyz.astype(np.float64), box)
-    rotation = np.array([0.0, 0, 0, 0, 0, 0, -goal[6]])  # a box, whose frame is rotated by -yaw
+    rotation = np.array([0.0, 0, 0, 0, 0, 0, -goal[6]])  # box at the origin that is rotated by -yaw
     return (to_box_frame(relative, rotation) + goal[:3]).astype(np.float32)
 
 

@@ -22,7 +22,7 @@ from lidar_perception.simulation.camera import (
     rotate_camera,
     select_labels,
 )
-from lidar_perception.simulation.drive import choose_scan_index, simulate_scan
+from lidar_perception.simulation.drive import count_drive_scans, simulate_scan
 from lidar_perception.simulation.scene import ALL_STREETS, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.training.augment import TrainingScene
@@ -128,7 +128,7 @@ class SimulatedScenes:
     def locate(self, i: int) -> tuple[int, int]:
         """Return the seed of the scene of scan i, and the number of the scan in its drive."""
         scene, scan = divmod(i, self.scans_per_scene)
-        return self.first_seed + scene, choose_scan_index(scan, self.scans_per_scene, self.sensor)
+        return self.first_seed + scene, scan * count_drive_scans(self.sensor) // self.scans_per_scene
 
     def cache_key(self, i: int) -> str:
         """Return the cache key of scan i."""

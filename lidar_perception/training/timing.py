@@ -53,7 +53,7 @@ def select_usable_scenes(scenes: Iterable[Item], prepare: Callable[[Any], Any]) 
     return usable_scenes
 
 
-def find_readable_frame(scenes: SceneReader, is_typical: Callable[[Any], bool] = lambda _: True) -> Any:
+def find_readable_frame(scenes: SceneReader, is_typical: Callable[[Any], bool]) -> Any:
     """Return the first validation frame that is typical, or the first readable one if none is.
 
     Raises:

@@ -55,7 +55,7 @@ def cuboid_to_box(val: Sequence[float], to_lidar: np.ndarray) -> tuple[list[floa
 
 
 def has_size(cuboid: dict[str, Any]) -> bool:
-    """Return True if a cuboid has a positive size; KITTI's DontCare regions have none."""
+    """Return True if a cuboid has a positive size, unlike those of KITTI's DontCare regions."""
     return not all(size <= 0 for size in cuboid["val"][-3:])
 
 

@@ -44,7 +44,7 @@ class RiderBuild(NamedTuple):
 
 
 def make_cyclist(rng: np.random.Generator) -> SceneObject:
-    """Make a cyclist who rides. The box is as long as the bicycle and as wide as the handlebar."""
+    """Make a riding cyclist. The box is as long as the bicycle and as wide as the handlebar."""
     size = draw_size(rng, CLASSES[CYCLIST])
     rider = RiderBuild(
         size,
@@ -59,11 +59,11 @@ def make_cyclist(rng: np.random.Generator) -> SceneObject:
     return SceneObject(partial(pose_rider, rider=rider), size, CLASSES[CYCLIST])
 
 
-def pose_rider(travelled: float, rider: RiderBuild) -> np.ndarray:
+def pose_rider(distance: float, rider: RiderBuild) -> np.ndarray:
     """Return the parts (P,) PART of a cyclist.
 
     Args:
-        travelled: Distance travelled in m, which determines the angle of the cranks.
+        distance: Distance travelled in m, which determines the angle of the cranks.
         rider: Properties of the cyclist.
     """
     length, width, height = rider.size
@@ -89,7 +89,7 @@ def pose_rider(travelled: float, rider: RiderBuild) -> np.ndarray:
         ),
         ellipsoid((hip[0], 0.0, seat + 0.02), (0.16, min(0.17, 0.4 * width), 0.11), rider.trousers),
     ]
-    crank_angle = rider.phase + 2 * pi * travelled / GEAR_M
+    crank_angle = rider.phase + 2 * pi * distance / GEAR_M
     for side, pedal_angle in ((-1, crank_angle), (1, crank_angle + pi)):
         foot = (-0.02 * length + CRANK_M * sin(pedal_angle), 0.17 * height + CRANK_M * cos(pedal_angle))
         thigh, shank = THIGH * rider_height, SHANK * rider_height

@@ -30,7 +30,7 @@ def make_pole(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_post(rng: np.random.Generator) -> np.ndarray:
-    """Make a thin post of 1.1 to 2.2 m, as at parking spaces, gates and plants; some with a small box or sign."""
+    """Make a thin post of 1.1 to 2.2 m, as used at parking spaces and gates; some carry a small box or sign."""
     height, radius = rng.uniform((1.1, 0.025), (2.2, 0.08))
     rows = [_make_post(height, radius)]
     if rng.random() < 0.5:
@@ -69,10 +69,10 @@ def make_traffic_light(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_sign(rng: np.random.Generator) -> np.ndarray:
-    """Make a post with one or two retroreflective plates, which are low on some, as on traffic islands.
+    """Make a post with one or two retroreflective plates.
 
-    Half of the low plates are on a mast. In KITTI, 15 % of the clusters as wide as a person are
-    partly retroreflective, most of them close to the ground.
+    Some plates are low, as on traffic islands, and half of these are on a mast. In KITTI, 15 % of
+    the clusters as wide as a person are partly retroreflective, most of them close to the ground.
     """
     plate_bottom = rng.uniform(1.7, 2.2) if rng.random() < 0.6 else rng.uniform(0.4, 1.0)
     size, child_rng = rng.uniform(0.25, 0.4), rng.spawn(1)[0]

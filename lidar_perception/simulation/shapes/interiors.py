@@ -168,7 +168,7 @@ def make_shelf(rng: np.random.Generator, length: float) -> np.ndarray:
 
 
 def make_table(rng: np.random.Generator, length: float, width: float) -> np.ndarray:
-    """Make a table, 0.7 to 0.78 m high, on four legs or a central foot, some with an object on it."""
+    """Make a table, 0.7 to 0.78 m high, with four legs or a central column, some with an object on it."""
     x, y, height = length / 2, width / 2, rng.uniform(0.7, 0.78)
     rows = [block((-x, -y, height - 0.04), (x, y, height), rng.uniform(0.2, 0.6))]
     if rng.random() < 0.6:
@@ -222,7 +222,7 @@ def make_counter(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_display(rng: np.random.Generator) -> np.ndarray:
-    """Make a display board on a foot, as large as a person."""
+    """Make a display board on a stand, as large as a person."""
     y, low, height = rng.uniform((0.2, 0.1, 1.5), (0.5, 0.9, 2.0))
     return make_parts(
         [

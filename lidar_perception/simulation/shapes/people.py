@@ -91,13 +91,13 @@ def _measure_stride(build: PersonBuild) -> tuple[float, float]:
     return low, high
 
 
-def pose_walker(travelled: float, build: PersonBuild) -> np.ndarray:
+def pose_walker(distance: float, build: PersonBuild) -> np.ndarray:
     """Return the parts (P,) PART of a person after a distance travelled in m.
 
     The last two rows before the load are the right and the left foot. Feet on the ground do not
     slip, and the hips are lower while the legs are apart.
     """
-    strides = build.phase + (travelled / (2 * build.step) if build.step else 0.0)
+    strides = build.phase + (distance / (2 * build.step) if build.step else 0.0)
     limbs, dz = _make_limb_parts(strides, build)
     trunk = _make_trunk_parts(build, dz)
     parts = _lean_back(make_parts(trunk[:5] + limbs + trunk[5:], PERSON), build.lean)
@@ -106,7 +106,7 @@ def pose_walker(travelled: float, build: PersonBuild) -> np.ndarray:
 
 
 def _lean_back(parts: np.ndarray, angle: float) -> np.ndarray:
-    """Tilt the parts (P,) PART of a person backwards by an angle in rad, in place. The feet and all heights stay."""
+    """Tilt the parts (P,) PART of a person backwards by an angle in rad, in place, without changing any height."""
     if angle:
         tangent, is_rod = tan(angle), parts["kind"] == CYLINDER
         parts["centre"][:, 0] -= tangent * parts["centre"][:, 2]

@@ -10,6 +10,7 @@ from math import atan2, hypot, pi
 from lidar_perception.simulation.solids import BOX, CYLINDER, ELLIPSOID, RETROREFLECTOR, make_part_row
 
 RUBBER, METAL, SKIN, GLASS, PLATE = 0.06, 0.3, 0.4, 0.04, RETROREFLECTOR  # reflectances
+PANE_THICKNESS_M = 0.01
 
 
 def box(centre: tuple, half_size: tuple, reflectance: float, **surface) -> tuple:
@@ -48,7 +49,7 @@ def disc(centre: tuple, radius: float, half_width: float, reflectance: float, **
 
 
 def slope(
-    front: tuple, back: tuple, half_width: float, reflectance: float, thickness: float = 0.01, **surface
+    front: tuple, back: tuple, half_width: float, reflectance: float, thickness: float = PANE_THICKNESS_M, **surface
 ) -> tuple:
     """Return a thin board across y from front (x, z) to back (x, z), such as a windscreen."""
     (x0, z0), (x1, z1) = front, back
@@ -56,19 +57,16 @@ def slope(
     return box(((x0 + x1) / 2, 0.0, (z0 + z1) / 2), half_size, reflectance, pitch=atan2(z1 - z0, x0 - x1), **surface)
 
 
-def upright_pane(x: tuple, low: tuple, high: tuple, reflectance: float, thickness: float = 0.01, **surface) -> tuple:
+def upright_pane(x: tuple, low: tuple, high: tuple, reflectance: float, **surface) -> tuple:
     """Return a thin board along x, such as a side window.
 
     Args:
         x: Rear and front end.
         low, high: Lower and upper edge, (y, z) each.
-        reflectance: Reflectance.
-        thickness: Thickness, m.
-        surface: See solids.make_part_row.
     """
     (y0, z0), (y1, z1) = low, high
     centre = ((x[0] + x[1]) / 2, (y0 + y1) / 2, (z0 + z1) / 2)
-    half_size = (thickness / 2, (x[1] - x[0]) / 2, hypot(y1 - y0, z1 - z0) / 2)
+    half_size = (PANE_THICKNESS_M / 2, (x[1] - x[0]) / 2, hypot(y1 - y0, z1 - z0) / 2)
     return box(centre, half_size, reflectance, yaw=pi / 2, pitch=atan2(y1 - y0, z1 - z0), **surface)
 
 

@@ -44,7 +44,7 @@ def make_rigid(parts: np.ndarray, size: tuple[float, float, float], label: str) 
     return SceneObject(partial(_return_parts, parts), size, label)
 
 
-def _return_parts(parts: np.ndarray, travelled: float) -> np.ndarray:
+def _return_parts(parts: np.ndarray, distance: float) -> np.ndarray:
     return parts
 
 

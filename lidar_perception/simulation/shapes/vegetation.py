@@ -87,7 +87,7 @@ def make_bush(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_shrub(rng: np.random.Generator) -> np.ndarray:
-    """Make a clipped shrub or a short piece of hedge of a person's size, as (P,) PART."""
+    """Make a clipped shrub or a short hedge as large as a person, as (P,) PART."""
     x, y, height = rng.uniform((0.2, 0.2, 0.8), (0.8, 0.4, 2.0))
     half_size, density = (x, y, height / 2 + 0.1), rng.uniform(4.0, 10.0)
     make = box if rng.random() < 0.4 else ellipsoid

@@ -26,18 +26,24 @@ from lidar_perception.simulation.solids import make_parts
 CAR = 10
 PILLAR_RADIUS_M = 0.035
 TAIL_LIGHT_REFLECTANCE = 0.9
-# Front and tail as on KITTI's cars (medians of 25 to 38 cars up to 40 m away). All distances are from the
-# box, which may include the mirrors. Front, middle third: 0.06 m at 0.25 to 0.35 of the height, 0.2 m at
-# 0.45, 0.33 m at 0.52 and 0.84 m at 0.62; 0.3 m more at 0.43 of the width from the middle. Tail: 0.06 m in
-# the middle third up to 0.7 of the height, 0.15 m at 0.86 of the half width, 0.4 m at 0.96. Sides: 0.04 m.
+# Distance of the surface from the box on KITTI's cars (medians of 25 to 38 cars up to 40 m away). Boxes may
+# include the mirrors.
+#   surface                  height / box height    distance in m
+#   front, middle third      0.25 to 0.35           0.06
+#                            0.45                   0.2
+#                            0.52                   0.33
+#                            0.62                   0.84
+#   front, 0.43 of the width from the middle        0.3 more
+#   tail, middle third       up to 0.7              0.06
+#   tail, at 0.86 of the half width                 0.15
+#   tail, at 0.96 of the half width                 0.4
+#   sides                                           0.04
 BUMPER = 0.29  # height of the foremost point, as a fraction of the height
 BONNET_GAP_M = 0.13  # distance from the front of the box to the middle of the bonnet's front edge
 CORNER_GAP_M = 0.3  # distance from the front of the box to the ends of the bonnet's front edge
 TAIL_GAP_M = 0.07  # distance from the rear of the box to the flat part of the tail
-TAIL_FLAT, TAIL_SIDE = (
-    0.59,
-    0.95,
-)  # outer ends of the flat and the rounded part of the tail, as fractions of the half width
+# Outer ends of the flat and the rounded part of the tail, as fractions of the half width.
+TAIL_FLAT, TAIL_SIDE = 0.59, 0.95
 TAIL_ROUND_M = 0.45  # length of the rounded part of the tail
 TAIL_LOW, TAIL_TOP = 0.22, 0.67  # lower and upper end of the closed part of the tail, as fractions of the height
 SIDE_GAP_M = 0.035  # distance from the side of the box to the body
