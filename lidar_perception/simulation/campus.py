@@ -20,6 +20,8 @@ from lidar_perception.simulation.terrain import PAVEMENT, Ground
 from lidar_perception.simulation.trajectory import DRIVE_SECONDS, ROBOT_RADIUS_M, Trajectory, draw_trajectory
 
 SHOULDER_M = 0.6  # distance from a path to benches and lamps
+ENDS_M = 25.0, 60.0  # minimum and maximum length of the court before and after the trajectory
+RACK_RATE = 1.5  # bicycle racks along the edges, per 100 m
 
 
 @dataclass(frozen=True)
@@ -39,14 +41,11 @@ class CampusKind:
     floor_objects: float = 0.5  # objects per 100 square metres
     edge_objects: float = 18.0  # objects along the edges, per 100 m
     benches: float = 5.0  # benches along the edges, per 100 m
-    racks: float = 1.5  # bicycle racks along the edges, per 100 m
+
     walkers: float = 0.0  # groups walking along x, per 100 m
     strollers: float = 0.0  # groups walking in any direction, per 100 square metres
     standers: float = 8.0  # standing groups, per 100 m
     riders: float = 3.0  # cyclists per 100 m
-    ends: tuple[float, float] = (25.0, 60.0)  # length of the court before the start and after the end of the trajectory
-    stop_chance: float = 0.15  # probability that the robot stands still
-    speed: tuple[float, float] = (0.5, 1.5)
 
 
 CAMPUS_KINDS = {
@@ -92,10 +91,10 @@ def make_campus(
     rng: np.random.Generator, kind: CampusKind, people: float
 ) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
     """Make the ground, actors and trajectory of a campus scene; `people` scales the number of people."""
-    trajectory = draw_trajectory(rng, kind.speed, kind.stop_chance, kind.max_heading)
+    trajectory = draw_trajectory(rng, kind.max_heading)
     court = Court.enclose(
         trajectory.sample(DRIVE_SECONDS, 1.0)[:, 1:],
-        rng.uniform(*kind.ends, 2),
+        rng.uniform(*ENDS_M, 2),
         np.array([rng.uniform(*kind.right), rng.uniform(*kind.left)]),
     )
     lane_width = rng.uniform(5.0, 7.0) if rng.random() < kind.lane_chance else 0.0
@@ -117,7 +116,7 @@ def make_campus(
             seat, *sitters = crowd.place_bench(rng, side, position, offset, people)
             if actors.admit(seat, gap=0.5):
                 actors.add(*sitters)
-        for position in draw_positions_along(rng, side.length, kind.racks):
+        for position in draw_positions_along(rng, side.length, RACK_RATE):
             actors.admit_each(_place_rack(rng, side, position, SHOULDER_M + 0.5 if kind.is_path else -1.4), gap=0.0)
     for first, *others in _place_floor_objects(rng, court.shrink(1.5), kind, people):
         if actors.admit(first, gap=0.3):

@@ -40,8 +40,6 @@ class IndoorKind:
     walkers: float = 0.0  # groups walking along x, per 100 m
     strollers: float = 0.0  # groups walking in any direction, per 100 square metres
     standers: float = 5.0  # standing groups, per 100 m
-    stop_chance: float = 0.15  # probability that the robot stands still
-    speed: tuple[float, float] = (0.5, 1.5)
 
 
 INDOOR_KINDS = {
@@ -111,7 +109,7 @@ def make_interior(
     rng: np.random.Generator, kind: IndoorKind, people: float
 ) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
     """Make the ground, actors and trajectory of an interior; `people` scales the number of people."""
-    trajectory = draw_trajectory(rng, kind.speed, kind.stop_chance, kind.max_heading)
+    trajectory = draw_trajectory(rng, kind.max_heading)
     actors = ActorSet(DRIVE_SECONDS, trajectory=trajectory, radius=ROBOT_RADIUS_M)
     court = Court.enclose(
         trajectory.sample(DRIVE_SECONDS, 1.0)[:, 1:], rng.uniform(*kind.ends, 2), rng.uniform(*kind.side_distance, 2)

@@ -15,6 +15,7 @@ from lidar_perception.simulation.street import CORNER_SIDEWALK_M, Street, Street
 
 PLANT_CLASSES = {70, 71}  # SemanticKITTI classes of plants
 BORDERS = (*[vegetation.make_hedge] * 3, *[furniture.make_fence] * 2, furniture.make_wall)
+ISLAND_CHANCE = 0.3  # probability that a crossing has traffic islands
 # (bushes per 100 m, trees per 100 m, depth of their strip in m) for a forest edge, a hedgerow and fields.
 WILD_FRONTS = ((110, 60, 4.0), (130, 12, 1.2), (8, 3, 15.0))
 RURAL_CLUTTER = (furniture.make_sign, furniture.make_beacon, furniture.make_bollard, furniture.make_pole)
@@ -195,7 +196,7 @@ def _place_islands(rng, street: Street) -> Iterator[Actor]:
     """Yield beacons and signs on traffic islands in the middle of the road, next to some crossings."""
     centre_y = (street.lanes[0].y + min(lane.y for lane in street.lanes if lane.direction < 0)) / 2
     for crossing in street.ground.crossings:
-        if rng.random() >= street.kind.island_chance:
+        if rng.random() >= ISLAND_CHANCE:
             continue
         for x, direction in zip(crossing, (-1, 1)):
             for distance in (rng.uniform(0.5, 2.0), rng.uniform(6.0, 15.0)):

@@ -20,6 +20,7 @@ from lidar_perception.simulation.street import CORNER_SIDEWALK_M, PARALLEL_STRIP
 
 DRAWBAR_M = 0.8  # gap between a car and its trailer
 FREE_CORNER_M = 5.0  # distance from a crossing to the first parked vehicle
+MAX_OCCUPANCY = 0.6  # maximum fraction of the parking spaces that are occupied
 OTHER_VEHICLE = 20  # SemanticKITTI class
 MAX_AT_WALL_M = 8.0  # maximum distance of a wall, fence or hedge from the curb
 AT_WALL_TRIES = 0.4  # attempts per replaced group to place a person at a wall; most attempts find no place
@@ -40,7 +41,7 @@ def populate(rng: np.random.Generator, street: Street, actors: ActorSet, people:
     for crossing in street.ground.crossings:
         actors.admit_each(_fill_side_street(rng, crossing, street.ground), gap=0.3)
     for side, factor in [(curb, 1.0) for curb in blocks] + [(curb, 0.7) for curb in street.side_curbs]:
-        actors.admit_each(_park_vehicles(rng, side, factor * rng.uniform(*kind.occupancy)))
+        actors.admit_each(_park_vehicles(rng, side, factor * rng.uniform(0.0, MAX_OCCUPANCY)))
     for side in blocks:
         for seat, *sitters in _place_seats(rng, side, kind.benches, people):
             if actors.admit(seat, gap=0.4):

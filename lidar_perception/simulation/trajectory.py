@@ -9,6 +9,8 @@ import numpy as np
 
 DRIVE_SECONDS = 20.0  # duration of a drive
 ROBOT_RADIUS_M = 0.35
+ROBOT_SPEEDS = 0.5, 1.5  # minimum and maximum speed of a robot, m/s
+STOP_CHANCE = 0.15  # probability that a robot stands still
 
 
 class TrajectoryPoint(NamedTuple):
@@ -58,17 +60,15 @@ class Trajectory(NamedTuple):
         return np.array([(t, *self.evaluate(t)[:2]) for t in times])
 
 
-def draw_trajectory(
-    rng: np.random.Generator, speed_range: tuple[float, float], stop_chance: float, max_heading: float
-) -> Trajectory:
+def draw_trajectory(rng: np.random.Generator, max_heading: float) -> Trajectory:
     """Draw a trajectory of a robot that stands still, or weaves with periods of 8 to 25 s.
 
     Args:
         max_heading: Maximum deviation of the heading from x, rad.
     """
-    if rng.random() < stop_chance:
+    if rng.random() < STOP_CHANCE:
         return Trajectory()
-    speed, rate = rng.uniform(*speed_range), 2 * np.pi / rng.uniform((8.0, 15.0), (15.0, 25.0))
+    speed, rate = rng.uniform(*ROBOT_SPEEDS), 2 * np.pi / rng.uniform((8.0, 15.0), (15.0, 25.0))
     # The maximum heading of one sinusoid is atan(amplitude * rate / speed); each of the two gets half of it.
     amplitude = 0.5 * speed * np.tan(max_heading * rng.uniform(0.3, 1.0, 2)) / rate
     phase = rng.uniform(-np.pi, np.pi, 2)

@@ -63,7 +63,7 @@ def test_trajectory_derivatives_are_exact():
     """Heading, velocity and yaw rate are derivatives of the position."""
     h = 1e-4
     for seed in range(20):
-        way = draw_trajectory(np.random.default_rng(seed), (0.5, 1.5), 0.2, 0.7)
+        way = draw_trajectory(np.random.default_rng(seed), 0.7)
         for t in (0.0, 3.3, 19.0):
             before, now, after = (way.evaluate(t + d) for d in (-h, 0.0, h))
             assert np.allclose(np.subtract(after[:2], before[:2]) / (2 * h), now.velocity, atol=1e-6)
