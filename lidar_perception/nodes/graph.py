@@ -88,19 +88,28 @@ def build_graph(detectors: Sequence[str], single: bool = False, tracking: bool =
     return {node: remap for graph in graphs for node, remap in graph.items()}
 
 
-def find_expert_range(detectors: Sequence[str], params: Mapping[str, Any]) -> str:
-    """Return the value of the parameter `range` of ground_segmentation.
+def find_expert_params(detectors: Sequence[str], params: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters of ground_segmentation that follow from its detectors.
 
-    It is ahead or around if all detectors use that range. It is all if the ranges differ, or if a
-    detector needs the full cloud or has its own weights. With range auto, the packaged weights
-    detect ahead.
+    Args:
+        detectors: names of detectors.
+        params: parameters of the detectors. With range auto, the packaged weights detect ahead.
+
+    Returns:
+        range: ahead or around if all detectors use that range; all if the ranges differ, or if a
+            detector needs the full cloud or has its own weights.
+        ground.patchwork.remove_reflections: False if all detectors ignore the intensity.
     """
     ranges = set()
     for name in detectors:
         detection_range = params.get(f"{name}.range", "auto")
         is_known = name in ("fused", "pointpillars") and not params.get(f"{name}.weights")
         ranges.add(("ahead" if detection_range == "auto" else detection_range) if is_known else "all")
-    return ranges.pop() if len(ranges) == 1 else "all"
+    uses_intensity = any(name not in NETWORKS or params.get(f"{name}.use_intensity", True) for name in detectors)
+    return {
+        "range": ranges.pop() if len(ranges) == 1 else "all",
+        **({} if uses_intensity else {"ground.patchwork.remove_reflections": False}),
+    }
 
 
 def find_trackers(detectors: Sequence[str]) -> dict[str, str]:

@@ -31,7 +31,7 @@ from lidar_perception.nodes.graph import (
     add_node_prefix,
     build_graph,
     find_executable,
-    find_expert_range,
+    find_expert_params,
     find_trackers,
     make_relative,
     runs_in_one_process,
@@ -237,7 +237,7 @@ def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:
             name=node,
             parameters=[
                 *add_arguments(files[base], node, list_argument_parameters(value, base, detectors)),
-                *(_list_expert_range(value, files) if base == "ground_segmentation" else ()),
+                *(_list_expert_params(value, files) if base == "ground_segmentation" else ()),
             ],
             # A parameter file may make any node read odometry; other nodes ignore the remapping.
             remappings=[(old, topics.get(new, new)) for old, new in {**remap, **ODOMETRY_INPUT}.items()],
@@ -272,8 +272,8 @@ def _find_package_file(detector: str, config_folder: Path) -> str:
     return str(config_folder / f"{CONFIGS[detector]}.param.yaml")
 
 
-def _list_expert_range(value: dict[str, str], files: dict[str, list[str]]) -> list[dict[str, str]]:
-    """Return the parameter `range` of ground_segmentation, [] if it is the default or set in a file.
+def _list_expert_params(value: dict[str, str], files: dict[str, list[str]]) -> list[dict[str, Any]]:
+    """Return the parameters of ground_segmentation that follow from its detectors and are not set in a file.
 
     files: {node: its parameter files}
     """
@@ -288,12 +288,11 @@ def _list_expert_range(value: dict[str, str], files: dict[str, list[str]]) -> li
         }
 
     params, detectors = read("ground_segmentation"), _parse_detectors(value)
-    if "range" in params:
-        return []
+    given = set(params)
     for node in [f"{name}_detector" for name in detectors if name in NETWORKS]:
         params |= read(node) | list_argument_parameters(value, node, detectors)
-    ground_range = find_expert_range(detectors, params)
-    return [] if ground_range == "all" else [{"range": ground_range}]
+    expert_params = {k: v for k, v in find_expert_params(detectors, params).items() if k not in given and v != "all"}
+    return [expert_params] if expert_params else []
 
 
 def _parse_detectors(value: dict[str, str]) -> list[str]:

@@ -48,6 +48,9 @@ FILES = {
 SEVERAL = "candidates,pointpillars,pointnet"
 
 
+KEEP_REFLECTIONS = {"ground.patchwork.remove_reflections": False}
+
+
 @pytest.mark.parametrize("name", FILES)
 def test_launch_file_starts_its_graph_or_single_detectors(name, load_launch_file):
     nodes = load_launch_file(name)
@@ -124,25 +127,29 @@ def test_graph_is_one_process_if_requested_or_on_few_cores(processes, cores, tog
 @pytest.mark.parametrize(
     ("detectors", "given", "expected"),
     [
-        ("fused", {}, "ahead"),
-        ("pointpillars,fused", {}, "ahead"),
-        ("pointnet,fused", {}, None),
-        ("fused", {"range": "around"}, "around"),
-        ("candidates", {}, None),
-        ("fused", {"weights": "mine.safetensors"}, None),
-        ("pointpillars,fused", {"config": "fused.range: around"}, None),
-        ("fused", {"config": "fused.range: around"}, "around"),
-        ("fused", {"config": "range: all"}, None),
+        ("fused", {}, {"range": "ahead"}),
+        ("pointpillars,fused", {}, {"range": "ahead"}),
+        ("pointnet,fused", {}, {}),
+        ("fused", {"range": "around"}, {"range": "around"}),
+        ("candidates", {}, {}),
+        ("fused", {"weights": "mine.safetensors"}, {}),
+        ("pointpillars,fused", {"config": "fused.range: around"}, {}),
+        ("fused", {"config": "fused.range: around"}, {"range": "around"}),
+        ("fused", {"config": "range: all"}, {}),
+        ("fused", {"config": "fused.use_intensity: false"}, {"range": "ahead"} | KEEP_REFLECTIONS),
+        ("pointnet", {"config": "pointnet.use_intensity: false"}, KEEP_REFLECTIONS),
+        ("pointnet,fused", {"config": "fused.use_intensity: false"}, {}),
     ],
 )
-def test_expert_nodes_use_the_range_of_the_detectors(detectors, given, expected, load_launch_file, tmp_path):
+def test_expert_parameters_follow_from_the_detectors(detectors, given, expected, load_launch_file, tmp_path):
     nodes = load_launch_file("detectors")
     if "config" in given:
         mine = tmp_path / "mine.yaml"
         mine.write_text(f"/**: {{ros__parameters: {{{given['config']}}}}}")
         given = {"config": str(mine)}
     *_, last = nodes(detectors=detectors, **given)["ground_segmentation"].parameters
-    assert (last.get("range") if isinstance(last, dict) else None) == expected
+    names = {"range", *KEEP_REFLECTIONS}
+    assert ({name: last[name] for name in names & {*last}} if isinstance(last, dict) else {}) == expected
 
 
 @pytest.mark.parametrize("detectors", ["pointnet,pointpillars", "pointpillars,pointnet"])

@@ -20,7 +20,7 @@ from lidar_perception.nodes.graph import (
     build_graph,
     configure_evaluator,
     find_connected_outputs,
-    find_expert_range,
+    find_expert_params,
     find_result_cloud_topic,
     list_awaited_topics,
     list_result_topics,
@@ -99,7 +99,7 @@ def replay(
     if "ground_segmentation" in graph:
         nodes["ground_segmentation"] = (
             graph["ground_segmentation"],
-            settings | {"range": find_expert_range([detector], settings)},
+            settings | find_expert_params([detector], settings),
         )
     nodes[TRACKER] = (
         graph[TRACKER],
