@@ -24,8 +24,7 @@ MAX_SEEDS = 8
 def make_automatic_source(params: SeedParams = SeedParams()) -> SeedSource:
     """Make a source whose seeds are the clusters that are most probably pedestrians.
 
-    There are up to MAX_SEEDS seeds, each with a probability of at least `params.min_confidence`;
-    none if no cluster has it.
+    It returns up to MAX_SEEDS seeds, each with a probability of at least `params.min_confidence`.
     """
 
     def source(segmented: SegmentedCloud) -> tuple[Seed, ...]:
@@ -43,8 +42,8 @@ def make_automatic_source(params: SeedParams = SeedParams()) -> SeedSource:
 def classify_pedestrians(segmented: SegmentedCloud) -> np.ndarray:
     """Return the probability (K,) float64 that each cluster of a segmented cloud is a pedestrian.
 
-    Uses the PointNet of the fused detector. The probability is -1 for clusters that are too large or
-    too small for a person, or have too few points for a seed.
+    The PointNet of the fused detector classifies them. The probability is -1 for clusters that are
+    too large or too small for a person, or have too few points for a seed.
     """
     surface = fit_ground_surface(segmented.xyz.compress(segmented.ground, axis=0), -SENSOR_HEIGHT)
     view = NormalizedView.of(PointCloud(segmented.xyz, segmented.intensity)).flatten(surface)

@@ -1,9 +1,9 @@
 """Ground segmentation by cloth simulation (paper C, Eq. 2 and 3; Zhang et al., Remote Sensing 2016, 8, 501).
 
 In the paper, a cloth falls onto the inverted cloud, and the points near the cloth are ground. Only
-the final position of the cloth matters, so it is computed directly instead of simulating the fall:
-seen upright, the cloth is pressed up against the lowest points. At rest, each particle either
-touches the lowest point of its cell or hangs free between its neighbours, bent by the load. This
+the final position of the cloth matters, so it is computed directly instead of simulating the fall.
+In the upright cloud, this is a cloth pressed against the lowest points from below: each particle
+either touches the lowest point of its cell or is held by its neighbours, bent by the load. This
 state is unique and does not depend on the order of points or steps (see cloth_solver.py).
 """
 

@@ -16,7 +16,7 @@ from numba import njit
 SWEEPS = 2  # sweeps before and after each correction
 COARSEST_SWEEPS = 40  # sweeps on the coarsest grid, which is about ten cells wide
 RELAXATION = 1.5  # over-relaxation factor on the coarsest grid
-MAX_CYCLES = 30  # five to seven are typical
+MAX_CYCLES = 30  # maximum number of V-cycles on the finest grid; five to seven are typical
 
 
 def settle_sheet(obstacle: np.ndarray, lift: float, tolerance: float, levels: int) -> np.ndarray:

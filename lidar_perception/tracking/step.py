@@ -94,7 +94,7 @@ def update(
 
     Args:
         states: States of N tracks, predicted to the time of this frame.
-        i: (P,) indices of the tracks with a detection; the other tracks have a miss.
+        i: (P,) indices of the tracks with a detection; a miss is counted for the others.
         boxes: (P, 7) detected boxes.
         class_ids: (P,) classes of the detections.
         scores: (P,) scores of the detections.

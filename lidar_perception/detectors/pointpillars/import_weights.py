@@ -14,14 +14,14 @@ Both projects use the same network with different names. These differences are c
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from lidar_perception.detectors.pointpillars.config import ANCHORS, AnchorClass, NetworkConfig, make_config
+from lidar_perception.detectors.pointpillars.config import NetworkConfig, make_config
 from lidar_perception.detectors.pointpillars.network import PointPillars, make_network
 from lidar_perception.types import InputError
 
@@ -184,24 +184,11 @@ def _make_config(project: Project, per_cell: int, classes: tuple[str, ...], path
             f"{path} has {per_cell} anchors per cell and therefore {per_cell // 2} classes, not {', '.join(names)}; "
             "name the classes in the order of training"
         )
-    anchor_by_name = {anchor.name: anchor for anchor in ANCHORS}
-    if unknown_names := [name for name in names if name not in anchor_by_name]:
-        raise InputError(f"no anchor for class {unknown_names[0]!r}; choose from {', '.join(anchor_by_name)}")
-    anchors = tuple(
-        AnchorClass(
-            name,
-            anchor_by_name[name].size,
-            project.bottoms[name] + anchor_by_name[name].size[2] / 2,
-            anchor_by_name[name].matched,
-            anchor_by_name[name].unmatched,
-        )
-        for name in names
-    )
-    return make_config(
+    config = make_config(
         "v0",
         "full",
+        names,
         xy_scale=1.0,
-        anchors=anchors,
         max_points=MAX_POINTS,
         zero_row=True,
         middle_z=True,
@@ -209,6 +196,8 @@ def _make_config(project: Project, per_cell: int, classes: tuple[str, ...], path
         anchors_at=project.anchors_at,
         direction_offset=project.direction_offset,
     )
+    anchors = (replace(anchor, z=project.bottoms[anchor.name] + anchor.size[2] / 2) for anchor in config.anchors)
+    return replace(config, anchors=tuple(anchors))
 
 
 def _map_names(project: Project, config: NetworkConfig) -> dict[str, str]:
