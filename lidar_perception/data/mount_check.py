@@ -20,8 +20,10 @@ FLOOR_PLANE = ThresholdParams(max_slope=10.0)  # settings of the plane fit
 STEEP_FLOOR_PLANE = ThresholdParams(max_slope=30.0)  # settings of the plane fit for a tilted sensor
 MIN_CELLS = 10  # minimum number of cells with points to fit a plane
 MIN_FLOOR_FRACTION = 0.25  # minimum fraction of cells whose lowest point is on the plane
-MAX_BEYOND_FRACTION = 0.33  # maximum fraction of points beyond a plane overhead that is the floor of an inverted sensor
-MIN_BEYOND_M = 0.3  # minimum distance from such a plane of a point that counts as beyond it
+# A plane above the sensor is the floor of an inverted sensor if at most MAX_BEYOND_FRACTION of the points are more
+# than MIN_BEYOND_M above it; otherwise it may be a ceiling or foliage.
+MAX_BEYOND_FRACTION = 0.33
+MIN_BEYOND_M = 0.3
 FIRST_CLOUDS = 3  # number of clouds to check at the start of a recording
 HEIGHT_TOLERANCE_M = 0.25  # tolerance between the parameter and the measured height
 MAX_TILT_DEG = 5.0  # maximum measured tilt that the slope of a road can explain

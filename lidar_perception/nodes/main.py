@@ -63,9 +63,9 @@ def run(name: str, arguments: list[str]) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     nodes, process_arguments = split_arguments(arguments)
-    from lidar_perception.nodes.shared_memory import is_fed_by_driver, use_large_shared_memory
+    from lidar_perception.nodes.shared_memory import reads_driver_clouds, use_large_shared_memory
 
-    use_large_shared_memory(any(map(is_fed_by_driver, nodes)))
+    use_large_shared_memory(any(map(reads_driver_clouds, nodes)))
     from lidar_perception.types import InputError
 
     try:

@@ -85,8 +85,8 @@ class Reception:
         self.adapt_trigger = node.create_guard_condition(self.adapt)
         self.link_trigger = node.create_guard_condition(self._take_linked)
         self.last_time: float | None = None  # monotonic time of the last cloud
-        self.missing_input: str | None = None  # data that the oldest waiting cloud, or the last cloud, still needs
-        self.missing_since: float | None = None  # monotonic time since which clouds lack that data
+        self.missing_input: str | None = None  # data that the oldest waiting or the last cloud needs
+        self.missing_since: float | None = None  # monotonic time when that data began to be missing
         self.waiting_since: float | None = None  # monotonic time of arrival of the oldest waiting cloud
         self.output: Output | None = None  # in-process source of the topic, used instead of a subscription
         self.subscription: Any = None

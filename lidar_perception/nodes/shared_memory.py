@@ -18,14 +18,14 @@ DRIVER_PROFILE = "fastdds_driver.xml"
 SOCKET_BUFFER = 2 * 2**20  # minimum net.core.rmem_max for DRIVER_PROFILE, in bytes
 
 
-def use_large_shared_memory(from_driver: bool = False) -> None:
+def use_large_shared_memory(is_fed_by_driver: bool = False) -> None:
     """Configure Fast DDS to pass complete clouds through shared memory, see fastdds.xml.
 
     If /dev/shm is small, such as the 64 MB of a container, segments are smaller. A profile that the
     user has set is not changed.
 
     Args:
-        from_driver: receive clouds by UDP if the socket buffer can hold one, see
+        is_fed_by_driver: receive clouds by UDP if the socket buffer can hold one, see
             fastdds_driver.xml.
     """
     if any(os.environ.get(name) for name in PROFILE_VARIABLES):
@@ -44,7 +44,7 @@ def use_large_shared_memory(from_driver: bool = False) -> None:
             "--shm-size=1g",
             file=sys.stderr,
         )
-    if from_driver and profile == "fastdds.xml" and read_socket_buffer_size() >= SOCKET_BUFFER:
+    if is_fed_by_driver and profile == "fastdds.xml" and read_socket_buffer_size() >= SOCKET_BUFFER:
         profile = DRIVER_PROFILE
     if profile:
         for name in PROFILE_VARIABLES:
@@ -89,6 +89,6 @@ def read_socket_buffer_size() -> int:
         return 0
 
 
-def is_fed_by_driver(arguments: list[str]) -> bool:
+def reads_driver_clouds(arguments: list[str]) -> bool:
     """Return True if no argument names the cloud of another node of this package (NODE/output/points)."""
     return not any(word.endswith("/output/points") for word in arguments)

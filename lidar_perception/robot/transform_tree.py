@@ -68,7 +68,7 @@ class _Link:
         return interpolate_poses(np.array(self.times[selection]), values[:, :3], values[:, 3:], at)
 
     def _select(self, begin: int, end: int, name: str, max_gap: float | None) -> slice:
-        """Select the poses that are needed for the times from `begin` to `end`, in ns.
+        """Select the poses needed to interpolate between the times `begin` and `end`, in ns.
 
         Raises:
             MissingTransform: The poses do not cover these times.

@@ -36,7 +36,6 @@ def make_frames(
         clouds: Arrays (N, 3) [x y z] in metres, or (N, 4) with intensity 0..1, in the sensor frame.
         labels: Labels of each cloud: GroundTruth, pairs (class name, [x y z l w h yaw]), or None
             for an unlabelled cloud.
-        frame_id: Coordinate frame of the clouds.
         hz: Number of clouds per second.
         start_ns: Stamp of the first cloud.
 
@@ -79,13 +78,8 @@ def write_rosbags_bag(
     """Write frames to a bag with rosbags and return its path.
 
     Args:
-        path: Folder of the bag.
-        frames: Frames to write.
         storage: "mcap" or "sqlite3".
         names: New names for topics of lidar_perception.wire.topics.
-
-    Raises:
-        InputError: The storage is unknown.
     """
     with tempfile.TemporaryDirectory() as folder:
         write_bag(Path(folder) / "bag", frames)
@@ -93,7 +87,7 @@ def write_rosbags_bag(
 
 
 def copy_bag(source: Path, path: Path, storage: str, names: Mapping[str, str] = {}) -> Path:
-    """Copy a bag with rosbags; for arguments and errors see write_rosbags_bag."""
+    """Copy a bag with rosbags; for the arguments see write_rosbags_bag. Raises InputError for an unknown storage."""
     if storage not in STORAGES:
         raise InputError(f"unknown storage '{storage}'; choose from {', '.join(STORAGES)}")
     with Bag(source) as source_bag, Writer(path, version=9, storage_plugin=STORAGES[storage]) as bag:

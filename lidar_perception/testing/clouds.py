@@ -19,8 +19,6 @@ def make_cloud_message(points: Any, stamp_ns: int = 1, frame_id: str = "lidar", 
 
     Args:
         points: (N, 3) [x y z] in metres, or (N, 4) with intensity; written as float32.
-        stamp_ns: Stamp of the cloud.
-        frame_id: Frame of the cloud.
         columns: Additional fields (N, ...) such as ground or ring, written with their own dtypes.
 
     Raises:

@@ -90,8 +90,7 @@ def assert_detections(
     possible, and then their total distance as small as possible.
 
     Args:
-        detections: Detections of any type that to_objects() accepts.
-        expected: Expected objects of any type that to_objects() accepts.
+        detections, expected: Objects of any type that to_objects() accepts.
         max_distance: Maximum distance between the centres of a pair, metres.
         min_iou: Minimum 3D IoU of a pair; if given, it replaces max_distance.
         same_class: True if the classes of a pair must be equal.

@@ -72,8 +72,7 @@ class Peer(ExternalNode):
         Args:
             publisher: Result of advertise().
             message: Message of a rosbags or rclpy class.
-            condition: Function that returns True when the wait is over.
-            description: What the condition waits for, for the error message.
+            condition, description: See wait().
         """
         data = encode(message) if hasattr(message, "__msgtype__") else message
         next_time = 0.0
@@ -148,10 +147,8 @@ class Peer(ExternalNode):
         """Wait for a diagnostic status of a node and return it.
 
         Args:
-            node: Name of the node.
             words: Text that the message must contain.
             level: 0 OK, 1 WARN, 2 ERROR, 3 STALE; None for any level.
-            timeout: Maximum duration in seconds.
         """
 
         def matches() -> bool:

@@ -53,13 +53,12 @@ class NodesUnderTest(Processes):
         """Start the nodes of one or several detectors, as the launch files do.
 
         Args:
-            detectors: Any of candidates, pointpillars and pointnet.
+            detectors: Names of detectors, see nodes.graph.
             params: Dataclass or mapping with parameter values; each node gets the parameters that
                 it declares.
             single: True to run each detector in one process; False to compute ground and clusters
                 once for all detectors.
             points: Topic of the clouds, relative to the namespace unless it starts with /.
-            namespace: Namespace of the nodes.
 
         Returns:
             The remappings of each node.
@@ -77,7 +76,6 @@ class NodesUnderTest(Processes):
         """Start bag_player, which waits up to two minutes for a subscriber of the clouds.
 
         Args:
-            bag: The bag to play.
             follow: Topics of detections. The next cloud is sent when the detections of the previous
                 clouds have arrived there, so that no cloud is lost on a slow machine.
             params: Other parameters of bag_player.

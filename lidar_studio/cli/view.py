@@ -133,12 +133,12 @@ def view(
 @contextmanager
 def _open_live_content(namespace: str, points: str, detections: tuple[str, ...]) -> Iterator[PageContent]:
     from lidar_perception.nodes import require_rclpy
-    from lidar_perception.nodes.shared_memory import is_fed_by_driver, use_large_shared_memory
+    from lidar_perception.nodes.shared_memory import reads_driver_clouds, use_large_shared_memory
     from lidar_studio.live_graph import LiveGraph
     from lidar_studio.server import PageContent
 
     require_rclpy()
-    use_large_shared_memory(points != "" and is_fed_by_driver([points]))
+    use_large_shared_memory(points != "" and reads_driver_clouds([points]))
     from lidar_studio.live_view import run_live_view  # imports rclpy, which must see the DDS profile set above
 
     name = "/".join(filter(None, (f"ROS domain {os.environ.get('ROS_DOMAIN_ID') or 0}", namespace.strip("/"))))

@@ -34,7 +34,7 @@ def test_driver_clouds_use_udp_with_large_socket_buffer(remap, buffer, profile, 
     for name in PROFILE_VARIABLES:
         monkeypatch.setenv(name, "")
     arguments = ["pointpillars_detector", "--ros-args", "-r", remap]
-    shared_memory.use_large_shared_memory(shared_memory.is_fed_by_driver(arguments))
+    shared_memory.use_large_shared_memory(shared_memory.reads_driver_clouds(arguments))
     assert {Path(os.environ[name]).name for name in PROFILE_VARIABLES} == {profile}
     assert Path(os.environ[PROFILE_VARIABLES[0]]).is_file()
     shared_memory.use_large_shared_memory(True)  # existing settings are kept

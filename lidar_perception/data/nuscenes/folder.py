@@ -145,10 +145,10 @@ def _get_frame_labels(all_labels: Callable, number: int) -> NuscenesLabels | Non
     return None if labels is None else labels[number]
 
 
-def _make_sensor_pose(ego: np.ndarray, mount: np.ndarray) -> np.ndarray:
+def _make_sensor_pose(ego_pose: np.ndarray, mount: np.ndarray) -> np.ndarray:
     """Return the pose (4, 4) at the sensor's position with the vehicle's axes."""
-    pose = ego.copy()
-    pose[:3, 3] += ego[:3, :3] @ mount[:3, 3]
+    pose = ego_pose.copy()
+    pose[:3, 3] += ego_pose[:3, :3] @ mount[:3, 3]
     return pose
 
 

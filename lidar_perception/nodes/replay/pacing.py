@@ -76,9 +76,9 @@ class Pace:
 
     def _give_up(self) -> None:
         """Stop waiting for the answers to the oldest cloud, and count them as missing."""
-        oldest = next(iter(self.unanswered_clouds))
-        self.missing_answers += len(self.unanswered_clouds.pop(oldest))
-        del self.sent_times[oldest]
+        oldest_stamp = next(iter(self.unanswered_clouds))
+        self.missing_answers += len(self.unanswered_clouds.pop(oldest_stamp))
+        del self.sent_times[oldest_stamp]
 
     def wait_for_room(self, serve: Callable[[], Any], is_stopped: Callable[[], bool]) -> None:
         """Call serve() until another cloud may be sent, or until is_stopped()."""
