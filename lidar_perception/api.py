@@ -264,9 +264,9 @@ def simulate(
     Raises:
         InputError: an argument is unknown or out of range.
     """
-    if frames < 1 or seed < 0:
-        name, value, low = ("frames", frames, 1) if frames < 1 else ("seed", seed, 0)
-        raise InputError(f"{name} = {value} must be {low} or more")
+    for name, value, low in (("frames", frames, 1), ("seed", seed, 0)):
+        if value < low:
+            raise InputError(f"{name} = {value} must be {low} or more")
     return simulate_recording(
         seed, frames, find_sensor(sensor, sensor_height or 0.0), scenes=Scenes(kind, people, scene)
     )

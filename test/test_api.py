@@ -81,6 +81,7 @@ def test_ground_and_clusters_equal_those_of_the_core():
         (lambda xyz: lp.segment_ground(xyz, sensor_height=-1.0), "height = -1.0 is outside"),
         (lambda xyz: lp.segment_ground(xyz[:, :2]), "expected \\(N, 3\\)"),
         (lambda xyz: lp.segment_ground(lp.PointCloud(xyz), intensity=xyz[:, 0]), "already has an intensity"),
+        (lambda xyz: lp.PointCloud.of(lp.PointCloud(xyz), xyz[:, 0]), "already has an intensity"),
         (lambda xyz: lp.cluster(xyz, "dbscam"), "did you mean 'dbscan'"),
         (lambda xyz: lp.cluster(xyz, min_sample=3), "did you mean 'min_samples'"),
         (lambda xyz: lp.cluster(xyz, ground=[True]), "ground has 1 values"),
