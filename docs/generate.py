@@ -191,7 +191,7 @@ def make_config_file(network: str) -> str:
         if key in defaults and value != defaults[key]
     }
     return _make_parameter_file(
-        f"The ground and clusters of detectors/{network}/params.py, for the nodes that find ground and clusters", values
+        f"Ground and clusters as in detectors/{network}/params.py, for the nodes ground_segmentation and clustering", values
     )
 
 
@@ -205,7 +205,7 @@ def _make_parameter_file(title: str, values: dict[str, Any]) -> str:
         node[name] = list(value) if isinstance(value, tuple) else value
     return (
         f"# {title}; made by docs/generate.py.\n"
-        "# Every parameter with its unit, range and default: docs/reference/nodes/.\n"
+        "# All parameters, with units, ranges and defaults: docs/reference/nodes/.\n"
         + yaml.safe_dump({"/**": {"ros__parameters": tree}}, sort_keys=False)
     )
 
