@@ -1,21 +1,17 @@
-"""Architecture: allowed imports between modules, and rules for all sources."""
+"""Architecture: allowed imports between modules, docstrings and types."""
 
 from __future__ import annotations
 
 import ast
 import subprocess
 import sys
-from configparser import ConfigParser
 from functools import cache
-from pathlib import Path
 
 import pytest
 from samples import for_all
+from sources import ROOT, SOURCES, list_files, parse_source
 
 pytestmark = pytest.mark.no_cover
-ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = "lidar_perception", "lidar_studio", "msg_utils"
-SOURCES = [p.relative_to(ROOT).as_posix() for package in PACKAGES for p in sorted((ROOT / package).rglob("*.py"))]
 ROS = {
     "rclpy",
     "ament_index_python",
@@ -30,7 +26,6 @@ ROS = {
     "builtin_interfaces",
     "rosbag2_py",
 }
-MAX_LINES = 400
 
 # Packages and modules from the lowest layer up; each imports only itself and lower layers.
 LAYERS = (
@@ -89,11 +84,6 @@ LIBRARIES = {
 }
 
 
-@cache  # not parsed on import, because every test process imports this file
-def parse_source(name):
-    return ast.parse((ROOT / name).read_text(encoding="utf-8"), name)
-
-
 @cache
 def find_imports(name, everywhere=True):
     """Return the modules that a source imports; a.b for `from a import b`.
@@ -130,10 +120,6 @@ def is_in(module, allowed):
 
 def is_standard(module):
     return module.partition(".")[0] in sys.stdlib_module_names
-
-
-def list_files(*folders):
-    return [name for name in SOURCES if any(name.startswith(f"{folder}/") for folder in folders)]
 
 
 def find_foreign_imports(name, allowed, everywhere=True):
@@ -297,26 +283,6 @@ def test_modules_have_no_circular_imports():
         visit(module)
 
 
-NAMING_CLASSES = (
-    "lidar_perception/classes.py",
-    "lidar_perception/data/",  # the names of formats
-    "lidar_perception/simulation/shapes/",  # a shape per class
-    "lidar_perception/detectors/pointpillars/import_weights.py",
-)
-
-
-@for_all([n for n in SOURCES if n.startswith("lidar_perception/") and not n.startswith(NAMING_CLASSES)])
-def test_class_names_are_only_in_their_table(name):
-    from lidar_perception.classes import CLASSES
-
-    written = {
-        node.value
-        for node in ast.walk(parse_source(name))
-        if isinstance(node, ast.Constant) and isinstance(node.value, str)
-    }
-    assert written & set(CLASSES) - {"DontCare", "Misc"} == set()
-
-
 @for_all(CORE)
 def test_every_public_function_has_a_docstring(name):
     without = [
@@ -356,42 +322,6 @@ def test_core_functions_without_numba_have_types(name):
         and not any("njit" in ast.unparse(d) for d in node.decorator_list)
         and not has_types(node)
     ] == []
-
-
-def test_mypy_ignores_no_module():
-    settings = ConfigParser()
-    settings.read(ROOT / "setup.cfg")
-    sections = {name: dict(settings[name]) for name in settings if name.startswith("mypy")}
-    assert sections["mypy"]["files"] == (
-        "lidar_perception, lidar_studio, msg_utils, scripts, benchmark, experiments, examples"
-    )
-    assert {
-        name for name, options in sections.items() if {"ignore_errors", "exclude", "follow_imports"} & set(options)
-    } == {"mypy-launch"}
-    assert [name for name in SOURCES if "# mypy:" in (ROOT / name).read_text()] == []
-
-
-@for_all(SOURCES)
-def test_modules_have_docstrings_and_specific_names(name):
-    assert ast.get_docstring(parse_source(name)), "no docstring"
-    parts = Path(name).with_suffix("").parts
-    assert not {"utils", "util", "helpers", "common", "misc"} & set(parts)
-
-
-@for_all(SOURCES)
-def test_source_files_have_at_most_400_lines(name):
-    assert len((ROOT / name).read_text(encoding="utf-8").splitlines()) <= MAX_LINES
-
-
-def test_constants_of_clustering_have_unique_names():
-    """Modules import constants from each other, so equal names would be ambiguous."""
-    files_by_name = {}
-    for name in list_files("lidar_perception/clustering"):
-        for node in parse_source(name).body:
-            if isinstance(node, ast.Assign) and isinstance(node.value, (ast.Constant, ast.BinOp)):
-                for target in node.targets:
-                    files_by_name.setdefault(ast.unparse(target), []).append(name)
-    assert len(files_by_name) > 10 and {n: w for n, w in files_by_name.items() if len(w) > 1} == {}
 
 
 # Modules, and libraries that they must not load. Starting Python takes a second, so one interpreter imports all
@@ -454,20 +384,3 @@ def test_modules_do_not_import_unneeded_libraries(cases):
         check=True,
     )
     assert result.stdout == ""
-
-
-def test_test_files_do_not_import_each_other():
-    """Shared code is in test/support or in a conftest.py."""
-    for path in sorted((ROOT / "test").rglob("*.py")):
-        imported = {
-            name.split(".")[-1]
-            for node in ast.walk(ast.parse(path.read_text()))
-            for name in (
-                [node.module or ""]
-                if isinstance(node, ast.ImportFrom)
-                else [a.name for a in node.names]
-                if isinstance(node, ast.Import)
-                else []
-            )
-        }
-        assert not [name for name in imported if name.startswith("test_")], path

@@ -123,10 +123,10 @@ def test_ground_is_scored_without_the_peer_libraries(nothing_installed, capsys):
 def test_every_version_is_timed_step_by_step_on_random_weights(one_thread, capsys, monkeypatch):
     points, ran, experts = make_scene(), {}, pointpillars.run_experts
 
-    def seen(frame, config, *given):
-        made = experts(frame, config, *given)
-        ran[config.version] = tuple(column is not None for column in made)
-        return made
+    def seen(frame, config, *arguments):
+        columns = experts(frame, config, *arguments)
+        ran[config.version] = tuple(column is not None for column in columns)
+        return columns
 
     monkeypatch.setattr(pointpillars, "run_experts", seen)
     content = measure_detection([PointCloud(points[:, :3], points[:, 3])], 1, ("compact",))

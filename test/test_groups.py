@@ -54,10 +54,10 @@ def test_ids_that_are_not_integers_are_rejected(value):
 def test_group_by_id_keeps_the_order_of_points(values, min_points):
     values = np.array(values, np.int64)
     found = group_by_id(values, min_points)
-    kept = [k for k in np.unique(values) if k > 0 and (values == k).sum() >= min_points]
-    assert found.numbers.tolist() == kept
+    large_ids = [k for k in np.unique(values) if k > 0 and (values == k).sum() >= min_points]
+    assert found.numbers.tolist() == large_ids
     parts = [found.rows[a:b].tolist() for a, b in zip(found.start, found.start[1:])]
-    assert parts == [np.flatnonzero(values == k).tolist() for k in kept]
+    assert parts == [np.flatnonzero(values == k).tolist() for k in large_ids]
 
 
 @given(ids)

@@ -128,8 +128,8 @@ def test_every_parameter_group_is_tested():
 
 @each_params
 def test_defaults_are_valid(kind):
-    made = kind()
-    assert flatten(made) == {n: f.default for n, f in collect_fields(made).items()}
+    params = kind()
+    assert flatten(params) == {n: f.default for n, f in collect_fields(params).items()}
 
 
 @each_field
@@ -211,8 +211,8 @@ def test_error_of_a_wrong_choice_lists_the_choices(group, f):
 
 
 def test_integers_become_floats():
-    made = ThresholdParams(max_height=2)
-    assert made.max_height == 2.0 and isinstance(made.max_height, float)
+    params = ThresholdParams(max_height=2)
+    assert params.max_height == 2.0 and isinstance(params.max_height, float)
     eps = DbscanParams(eps=[1, 2, 3]).eps
     assert eps == (1.0, 2.0, 3.0) and all(isinstance(v, float) for v in eps)
 
@@ -225,8 +225,8 @@ def test_parameters_cannot_be_changed_in_place(group, f):
 
 @pytest.mark.parametrize("limits, eps", [((), (0.2,)), ((10.0,), (0.1, 0.2))])
 def test_dbscan_accepts_any_number_of_bands(limits, eps):
-    made = DbscanParams(range_limits=list(limits), eps=list(eps))
-    assert (made.range_limits, made.eps) == (limits, eps)
+    params = DbscanParams(range_limits=list(limits), eps=list(eps))
+    assert (params.range_limits, params.eps) == (limits, eps)
 
 
 def test_eps_must_have_one_value_more_than_range_limits():

@@ -106,8 +106,8 @@ def test_bad_input_prints_one_line_to_stderr_and_exits_with_2(case, kitti, bag, 
 
 
 def test_bag_without_clouds_is_bad_input(tmp_path, monkeypatch, capsys):
-    with BagWriter(tmp_path / "bag") as made:
-        made.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
     for command in "nuscenes", "detection":
         assert (
             run_main(

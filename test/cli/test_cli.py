@@ -224,7 +224,7 @@ def test_data_argument_and_data_option_are_equivalent(words, tmp_path, monkeypat
     needs_out = "detect", "setup", "train", "seed"
     out = ("--out", tmp_path / "out") if words[0] in needs_out else ()
     results = ("--results", tmp_path / "r.json") if words[-1] == "nuscenes" else ()
-    said = {}
+    outputs = {}
     for name, value in {
         "argument": ["none"],
         "option": ["--data", "none"],
@@ -234,10 +234,10 @@ def test_data_argument_and_data_option_are_equivalent(words, tmp_path, monkeypat
         if name == "neither" and words[0] in ("demo", "view"):
             continue
         assert run_main(monkeypatch, *words, *value, *out, *results) == 2
-        said[name] = capsys.readouterr().err.splitlines()[-1]
-    assert said["argument"] == said["option"] and "none does not exist" in said["argument"]
-    assert "expected one DATA" in said["both"]
-    assert "DATA is missing" in said.get("neither", "DATA is missing")
+        outputs[name] = capsys.readouterr().err.splitlines()[-1]
+    assert outputs["argument"] == outputs["option"] and "none does not exist" in outputs["argument"]
+    assert "expected one DATA" in outputs["both"]
+    assert "DATA is missing" in outputs.get("neither", "DATA is missing")
     assert not (tmp_path / "out").exists()
 
 

@@ -123,8 +123,8 @@ def test_misspelled_parameter_is_reported(tmp_path, capsys):
         "    input.ahead: 3.0\n    ground: {sensor_pose: {heigth: 0.6}}\n",
     )
     assert read_config(file, PipelineParams()) == {}
-    (said,) = capsys.readouterr().err.splitlines()
-    assert ".heigth' is ignored; did you mean 'ground.sensor_pose.height'" in said
+    (line,) = capsys.readouterr().err.splitlines()
+    assert ".heigth' is ignored; did you mean 'ground.sensor_pose.height'" in line
 
 
 SECTIONS = """
@@ -156,9 +156,13 @@ def parse_options(*arguments, tracking=False) -> dict:
 
 def test_only_sections_of_the_command_are_read(tmp_path, capsys):
     file = write_file(tmp_path / "p.yaml", SECTIONS)
-    made = parse_options("--config", file, "--set", "crop.min_range=3", tracking=True)
-    assert made["detector"].settings == {"ground.method": "threshold", "fused.scores.car": 0.7, "crop.min_range": 3.0}
-    assert made["tracking"].min_score == 0.3
+    options = parse_options("--config", file, "--set", "crop.min_range=3", tracking=True)
+    assert options["detector"].settings == {
+        "ground.method": "threshold",
+        "fused.scores.car": 0.7,
+        "crop.min_range": 3.0,
+    }
+    assert options["tracking"].min_score == 0.3
     other = parse_options("--weights", "pointnet", "--config", file)["detector"]
     assert other.settings == {"ground.method": "threshold", "crop.min_range": 9.0, "pointnet.min_points": 5}
     assert capsys.readouterr().err == ""
@@ -179,7 +183,7 @@ def test_probable_typos_in_a_parameter_file_are_reported(text, said, tmp_path, c
 
 
 def test_detector_settings_take_precedence_over_options():
-    made = parse_options(
+    choice = parse_options(
         "--weights",
         "pointpillars",
         *make_set_options(
@@ -189,7 +193,7 @@ def test_detector_settings_take_precedence_over_options():
             "pointpillars.warm_up=no",
         ),
     )["detector"]
-    detector = made.open(sensor_height=1.0, min_score=0.001)
+    detector = choice.open(sensor_height=1.0, min_score=0.001)
     assert detector.min_scores == {"Car": 0.7, "Pedestrian": 0.001, "Cyclist": 0.001}
     assert detector.range == "around" and detector.params.ground.sensor_pose.height == 1.0
     with pytest.raises(InputError, match="give only one of them"):

@@ -224,9 +224,9 @@ def test_clusters_100_km_away_are_found_like_near_ones():
     # Steps of 1/64 m are exact in float32 at that distance.
     rng = np.random.default_rng(8)
     xyz = (rng.integers(-64, 64, (400, 3)) / 64).astype(np.float32)
-    moved = xyz + np.float32([8e4, -6e4, 16])
-    np.testing.assert_array_equal(dbscan(moved, 0.25, 5), cluster_by_sklearn(moved, 0.25, 5))
-    assert to_partition(dbscan(moved, 0.25, 5)) == to_partition(dbscan(xyz, 0.25, 5))
+    distant_xyz = xyz + np.float32([8e4, -6e4, 16])
+    np.testing.assert_array_equal(dbscan(distant_xyz, 0.25, 5), cluster_by_sklearn(distant_xyz, 0.25, 5))
+    assert to_partition(dbscan(distant_xyz, 0.25, 5)) == to_partition(dbscan(xyz, 0.25, 5))
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -82,8 +82,8 @@ def full_density(scan):
 @given(st.floats(0.05, 1.0), st.integers(0, 99))
 def test_density_falls_when_points_are_removed(scan, full_density, share, seed):
     xyz = scan.frame.xyz
-    kept = np.random.default_rng(seed).random(len(xyz)) < share
-    assert measure_density(xyz[kept]) == pytest.approx(share * full_density, rel=0.08)
+    is_kept = np.random.default_rng(seed).random(len(xyz)) < share
+    assert measure_density(xyz[is_kept]) == pytest.approx(share * full_density, rel=0.08)
 
 
 def test_cropping_and_scaling_keep_the_density(scan):
@@ -155,9 +155,9 @@ def test_no_real_scan_of_an_hdl_64e_counts_as_sparse(layout):
 
 @pytest.mark.parametrize("params", ADAPTIVE[::2], ids=["PointNet", "people"])
 def test_adaptation_keeps_objects_of_sparse_clouds_whole(params, scan):
-    kept = np.random.default_rng(1).random(len(scan.frame)) < 0.1
-    xyz = scan.frame.xyz[kept]
-    ground = np.isin(scan.semantic[kept], (40, 44, 48, 49, 60, 72))
+    is_kept = np.random.default_rng(1).random(len(scan.frame)) < 0.1
+    xyz = scan.frame.xyz[is_kept]
+    ground = np.isin(scan.semantic[is_kept], (40, 44, 48, 49, 60, 72))
 
     def count_whole(params):
         """Count objects that contain most of a cluster which contains most of the object."""

@@ -130,12 +130,12 @@ def test_labels_do_not_depend_on_the_frame(params):
     """The clusters are so far apart that rounding does not matter."""
     xyz = make_blobs(3, [[0, 0, 0], [8, 0, 0], [0, 9, 1], [-7, -7, 0]])
     turn = np.array([[np.cos(0.7), -np.sin(0.7), 0], [np.sin(0.7), np.cos(0.7), 0], [0, 0, 1]])
-    moved = (xyz.astype(float) @ turn.T + [30, -20, 1]).astype(np.float32)
+    moved_xyz = (xyz.astype(float) @ turn.T + [30, -20, 1]).astype(np.float32)
     labels = cluster_euclidean(xyz, params)
     assert labels.max() >= 4
     # Without merging, because its diameters are those of axis-aligned boxes and depend on the rotation.
     unmerged = replace(params, gamma=0.0)
-    assert (cluster_euclidean(xyz, unmerged) == cluster_euclidean(moved, unmerged)).mean() > 0.999
+    assert (cluster_euclidean(xyz, unmerged) == cluster_euclidean(moved_xyz, unmerged)).mean() > 0.999
     shifted = cluster_euclidean(xyz + np.float32([16, -32, 0]), params)
     np.testing.assert_array_equal(shifted > 0, labels > 0)
 

@@ -67,10 +67,10 @@ def test_thinned_points_represent_neighbours_of_their_kind():
     rng = np.random.default_rng(0)
     xyz, kind = rng.random((4000, 3)), rng.integers(0, 2, 4000)
     reach = rng.choice([0.3, 3.0], 4000)
-    kept, group = thinning.thin_points(xyz, reach, kind)
-    assert len(kept) < 4000 and (group[kept] == np.arange(len(kept))).all()
-    assert (kind[kept[group]] == kind).all() and (reach[kept[group]] == reach).all()
-    distance = np.linalg.norm(xyz - xyz[kept[group]], axis=1)
+    representatives, group = thinning.thin_points(xyz, reach, kind)
+    assert len(representatives) < 4000 and (group[representatives] == np.arange(len(representatives))).all()
+    assert (kind[representatives[group]] == kind).all() and (reach[representatives[group]] == reach).all()
+    distance = np.linalg.norm(xyz - xyz[representatives[group]], axis=1)
     assert (distance <= thinning.SLACK / 2 * reach).all()
     assert [len(x) for x in thinning.thin_points(np.zeros((0, 3)), 1.0)] == [0, 0]
 

@@ -167,15 +167,15 @@ def test_sampling_bounds_the_cost_of_local_thresholds(arrange):
     for count in (2000, 8000):
         cells = sort_into_cells(make_points(arrange, count), 0.5)
         sample = sample_cells(cells, 27 * 50 * count)  # at most 50 points per cell
-        kept = np.diff(sample.start)
-        assert kept.min() >= 1 and (kept <= np.diff(cells.start)).all()
-        np.testing.assert_allclose(kept * sample.weight, np.diff(cells.start))
+        sample_sizes = np.diff(sample.start)
+        assert sample_sizes.min() >= 1 and (sample_sizes <= np.diff(cells.start)).all()
+        np.testing.assert_allclose(sample_sizes * sample.weight, np.diff(cells.start))
         near = [
             sum(
-                kept[low:high].sum()
+                sample_sizes[low:high].sum()
                 for low, high in zip(cells.low[a, : cells.ranges[a]], cells.high[a, : cells.ranges[a]])
             )
-            for a in range(len(kept))
+            for a in range(len(sample_sizes))
         ]
         assert np.diff(cells.start) @ near <= 27 * 50 * count
 

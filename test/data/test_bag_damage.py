@@ -40,10 +40,10 @@ def test_existing_bag_is_replaced_only_with_force(tmp_path):
     "make", [lambda p: write_file(p / "bag", b"text"), lambda p: write_file(p / "bag/notes.txt", b"text")]
 )
 def test_force_replaces_only_bags(tmp_path, make):
-    kept = make(tmp_path)
+    path = make(tmp_path)
     with pytest.raises(InputError, match="is not a bag"):
         write_bag(tmp_path / "bag", scans(1), force=True)
-    assert kept.read_bytes() == b"text"
+    assert path.read_bytes() == b"text"
     write_bag(tmp_path / "other", scans(1))
     notes = write_file(tmp_path / "other/notes.txt", b"text")
     with pytest.raises(InputError, match=r"1 other files, such as notes.txt"):

@@ -103,21 +103,21 @@ def test_converted_bag_equals_the_recording(tmp_path, kind):
         assert np.array_equal(got.xyz, expected.xyz)
         assert np.array_equal(got.intensity, expected.intensity)
         assert got.stamp_ns == expected.stamp_ns
-        pose, again = frame.pose(), read.pose()
-        assert (pose is None) == (again is None)
+        pose, read_pose = frame.pose(), read.pose()
+        assert (pose is None) == (read_pose is None)
         if pose is not None:
-            np.testing.assert_allclose(again, pose, atol=1e-6)
-        labels, again = frame.point_truth(), read.point_truth()
-        assert (labels is None) == (again is None)
+            np.testing.assert_allclose(read_pose, pose, atol=1e-6)
+        labels, read_pose = frame.point_truth(), read.point_truth()
+        assert (labels is None) == (read_pose is None)
         if labels is not None:
-            assert np.array_equal(again.classes, labels.classes)
-            assert np.array_equal(again.instances, labels.instances)
-        truth, again = frame.truth(), read.truth()
-        assert (truth is None) == (again is None)
+            assert np.array_equal(read_pose.classes, labels.classes)
+            assert np.array_equal(read_pose.instances, labels.instances)
+        truth, read_pose = frame.truth(), read.truth()
+        assert (truth is None) == (read_pose is None)
         if truth is not None:
-            np.testing.assert_allclose(again.boxes, truth.boxes, atol=1e-9)
-            assert again.labels == truth.labels and len(again.notes) == len(truth.notes)
-            for a, b in zip(again.extras, truth.extras, strict=True):
+            np.testing.assert_allclose(read_pose.boxes, truth.boxes, atol=1e-9)
+            assert read_pose.labels == truth.labels and len(read_pose.notes) == len(truth.notes)
+            for a, b in zip(read_pose.extras, truth.extras, strict=True):
                 assert a.keys() == b.keys()
                 np.testing.assert_equal([a.get("track_id"), a.get("category")], [b.get("track_id"), b.get("category")])
     with Bag(tmp_path / "made") as converted:  # the calibration is written when it changes

@@ -37,13 +37,13 @@ def format_points(columns=CLOUD, form="{:.6f}"):
 def make_padded_pcd(count0):
     """Return a PCD file with padding and an empty field."""
     kind = np.dtype([("xyz", "<f4", 3), ("pad", "V4"), ("intensity", "<f4"), ("end", "V2")])
-    made = np.zeros(len(CLOUD), kind)
-    made["xyz"], made["intensity"] = CLOUD[:, :3], CLOUD[:, 3]
+    points = np.zeros(len(CLOUD), kind)
+    points["xyz"], points["intensity"] = CLOUD[:, :3], CLOUD[:, 3]
     return (
         make_pcd_header(
             f"x y z _ intensity {count0} _", "F F F U F U U", "4 4 4 1 4 1 1", more="COUNT 1 1 1 4 1 0 2\n"
         ).encode()
-        + made.tobytes()
+        + points.tobytes()
     )
 
 
@@ -261,8 +261,8 @@ def test_times_in_file_names_need_no_leading_zeros(tmp_path, names, expected):
 )
 def test_unsupported_formats_are_reported_with_a_converter(tmp_path, file, words):
     path = write_file(tmp_path / file, b"LASF")
-    for given in (path, tmp_path):
+    for source in (path, tmp_path):
         for opener in (open_recording, open_clouds):
             with pytest.raises(InputError, match=words) as error:
-                opener(given)
+                opener(source)
             assert "\n" not in str(error.value) and path.name in str(error.value)

@@ -60,14 +60,14 @@ def test_labels_survive_conversion_to_markers_and_back(lines):
 def test_computed_label_matches_its_box(line):
     label = parse_label(line)
     truth = to_ground_truth([label], LIDAR_TO_CAMERA)
-    (again,) = to_labels(GroundTruth.of(truth.boxes, truth.class_ids), LIDAR_TO_CAMERA)
-    assert again["class"] == label["class"]
-    np.testing.assert_allclose(again["dimensions"], label["dimensions"], atol=1e-9)
-    np.testing.assert_allclose(again["location"], label["location"], atol=1e-9)
-    assert abs(np.sin((again["rotation_y"] - label["rotation_y"]) / 2)) < 0.0025
+    (computed_label,) = to_labels(GroundTruth.of(truth.boxes, truth.class_ids), LIDAR_TO_CAMERA)
+    assert computed_label["class"] == label["class"]
+    np.testing.assert_allclose(computed_label["dimensions"], label["dimensions"], atol=1e-9)
+    np.testing.assert_allclose(computed_label["location"], label["location"], atol=1e-9)
+    assert abs(np.sin((computed_label["rotation_y"] - label["rotation_y"]) / 2)) < 0.0025
     x, _, z = label["location"]  # alpha: heading relative to the ray to the object
-    assert abs(np.sin((again["alpha"] - (again["rotation_y"] - np.arctan2(x, z))) / 2)) < 1e-9
-    assert -np.pi <= again["alpha"] <= np.pi
+    assert abs(np.sin((computed_label["alpha"] - (computed_label["rotation_y"] - np.arctan2(x, z))) / 2)) < 1e-9
+    assert -np.pi <= computed_label["alpha"] <= np.pi
 
 
 @given(draw_label_line().filter(lambda line: not line.startswith("DontCare")))

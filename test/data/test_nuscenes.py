@@ -141,11 +141,11 @@ def test_global_transform_is_invertible(seed, yaw, pitch, roll):
     pose[:3, :3] = Rotation.from_euler("zyx", [yaw, pitch, roll]).as_matrix()
     pose[:3, 3] = rng.uniform(-2000, 2000, 3)
     boxes = np.column_stack([rng.uniform(-50, 50, (5, 3)), rng.uniform(0.3, 9, (5, 3)), rng.uniform(-3.1, 3.1, 5)])
-    moved = GlobalBoxes.of(*to_global_boxes(boxes, pose), 0)
-    np.testing.assert_allclose(to_local_boxes(moved, pose), boxes, atol=1e-8)
+    global_boxes = GlobalBoxes.of(*to_global_boxes(boxes, pose), 0)
+    np.testing.assert_allclose(to_local_boxes(global_boxes, pose), boxes, atol=1e-8)
     # The box moves rigidly: its corners are transformed like points.
     corners = box_corners(boxes)
-    for box, centre, rotation, own in zip(boxes, moved.centres, moved.rotations, corners):
+    for box, centre, rotation, own in zip(boxes, global_boxes.centres, global_boxes.rotations, corners):
         signs = np.array([[x, y, z] for z in (-1, 1) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))]) / 2
         expected = Rotation.from_quat(np.roll(rotation, -1)).apply(signs * box[3:6]) + centre
         np.testing.assert_allclose(own @ pose[:3, :3].T + pose[:3, 3], expected, atol=1e-8)

@@ -230,11 +230,11 @@ def test_unusable_returns_are_dropped_from_all_columns(tmp_path):
     bad = {3: np.nan, 10: np.inf, 11: -np.inf, 20: 0.0, 21: 1e6}
     for index, value in bad.items():
         xyz[index] = value
-    kept = np.setdiff1d(np.arange(len(xyz)), list(bad))
+    usable = np.setdiff1d(np.arange(len(xyz)), list(bad))
     before = xyz.copy(), intensity.copy()
     frame = PointCloud.of(xyz, intensity, 5, "velodyne")
-    assert np.array_equal(frame.xyz, xyz[kept].astype(np.float32))
-    assert np.array_equal(frame.intensity, kept) and (frame.stamp_ns, frame.frame_id) == (5, "velodyne")
+    assert np.array_equal(frame.xyz, xyz[usable].astype(np.float32))
+    assert np.array_equal(frame.intensity, usable) and (frame.stamp_ns, frame.frame_id) == (5, "velodyne")
     assert frame.xyz.dtype == np.float32 and frame.xyz.flags.c_contiguous
     assert np.array_equal(before[0], xyz, equal_nan=True) and np.array_equal(before[1], intensity)
     assert PointCloud.of(xyz).intensity is None and len(PointCloud.of(xyz[:0])) == 0
@@ -242,7 +242,7 @@ def test_unusable_returns_are_dropped_from_all_columns(tmp_path):
     write_scan(tmp_path / "sequences/00", 0, np.column_stack([xyz, unit]), np.arange(len(xyz)), np.arange(len(xyz)))
     (read,) = open_recording(tmp_path)
     assert np.array_equal(read.load().intensity, unit[read.point_truth().classes])
-    assert np.array_equal(read.point_truth().instances, kept)
+    assert np.array_equal(read.point_truth().instances, usable)
 
 
 def test_semantickitti_poses_are_read_unchanged(tmp_path):

@@ -29,16 +29,16 @@ LAYOUT = [
 
 def make_points(n=200):
     rng = np.random.default_rng(1)
-    made = np.zeros(n, LAYOUT)
-    for name in made.dtype.names:
-        part = made[name]
+    points = np.zeros(n, LAYOUT)
+    for name in points.dtype.names:
+        part = points[name]
         part[...] = (
             rng.normal(0, 10, part.shape)
             if part.dtype.kind == "f"
             else rng.integers(0, np.iinfo(part.dtype).max // 2, part.shape, np.int64)
         )
-    made["ring"] = np.arange(n) // 20  # runs of equal values, which compress well
-    return made
+    points["ring"] = np.arange(n) // 20  # runs of equal values, which compress well
+    return points
 
 
 def compress_lzf(data):
@@ -194,11 +194,11 @@ def test_records_with_other_columns_are_rejected(tmp_path, more):
 
 
 def make_bag_points(n):
-    made = make_points(n)
+    points = make_points(n)
     layout = [(name, kind) for name, kind, *_ in LAYOUT[:5]]
     cloud = np.empty(n, layout)
     for name, _ in layout:
-        cloud[name] = made[name]
+        cloud[name] = points[name]
     return cloud
 
 

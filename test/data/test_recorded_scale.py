@@ -115,8 +115,8 @@ def test_scale_does_not_depend_on_order_of_frames(tmp_path, layout, full, whole)
     assert np.array_equal(next(iter(open_recording(path))).load().intensity, expected[0])
     if layout in ("bin_files", "pcd_files", "bag_files"):  # as `convert --robot` does
         assert np.array_equal(level_frame(frames[0], SensorMount()).load().intensity, expected[0])
-        given = level_frame(frames[0], SensorMount(intensity_max=10.0)).load().intensity
-        assert np.allclose(given, expected[0] * full / 10)
+        intensity = level_frame(frames[0], SensorMount(intensity_max=10.0)).load().intensity
+        assert np.allclose(intensity, expected[0] * full / 10)
 
 
 @pytest.mark.parametrize(

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 from dataclasses import replace
 from functools import partial
 
-import detect_samples
 import numpy as np
 import pytest
 from bag_samples import cloud_frame, scans
 from cli_samples import evaluate_detection
 from detect_samples import NAME, MadeDetector, detect, detect_with_error, list_objects, make_run, read_json
-from kitti_samples import write_tracking_folder
-from PIL import Image
 from recording_samples import MADE
-from samples import STAMP, make_scene, make_walker_label, write_file, write_object_folder
+from samples import STAMP, make_scene, write_file
 
 from lidar_perception.camera import FORWARD_CAMERA
 from lidar_perception.data.bag import Bag
@@ -28,9 +24,7 @@ from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detecting.bag import Bag as BagFormat
 from lidar_perception.detecting.formats import Json
 from lidar_perception.detecting.run import detect as run_detector
-from lidar_perception.detectors import open as opening
 from lidar_perception.detectors.contract import DetectionResult
-from lidar_perception.detectors.open import LOAD
 from lidar_perception.labels.exchange import import_labels
 from lidar_perception.scoring.recorded import read_objects_by_stamp
 from lidar_perception.scoring.run import fill_report
@@ -42,27 +36,6 @@ from lidar_studio.results import choose_points_topic, read_recorded_results
 from msg_utils.detections import from_detection_array
 
 ALL = "kitti,json,csv,mcap,openlabel"
-
-
-@pytest.fixture(autouse=True)
-def stand_in_calls(monkeypatch):
-    """Register MadeDetector under NAME, and return the list of its calls."""
-    monkeypatch.setitem(LOAD, NAME, "")
-    monkeypatch.setattr(opening, "_find_loader", lambda kind: detect_samples.load_made_detector)
-    monkeypatch.setattr(MadeDetector, "calls", [])
-    return MadeDetector.calls
-
-
-@pytest.fixture
-def kitti(tmp_path):
-    """Four labelled frames."""
-    return write_object_folder(tmp_path / "kitti", make_walker_label() + "\n", 4)
-
-
-@pytest.fixture
-def drives(tmp_path):
-    """Two sequences, of three and of two frames."""
-    return write_tracking_folder(tmp_path / "drives")
 
 
 # Output files
@@ -375,33 +348,3 @@ def test_non_finite_numbers_are_not_written(kitti, tmp_path, monkeypatch, capsys
 def test_unusable_options_are_rejected(arguments, message, kitti, tmp_path, monkeypatch, capsys, stand_in_calls):
     assert detect(monkeypatch, kitti, "--out", tmp_path / "out", *arguments) == 2
     assert message in capsys.readouterr().err and stand_in_calls == [] and not (tmp_path / "out").exists()
-
-
-# Pictures and videos
-
-
-def test_pictures_and_video_show_every_frame(drives, tmp_path, monkeypatch, stand_in_calls):
-    out, video = tmp_path / "out", tmp_path / "films/drive.gif"
-    assert detect(monkeypatch, drives, "--out", out, "--png", "--video", video, "--track", "--ego", "none") == 0
-    names = [frame.name for frame in open_recording(drives)]
-    images = {name: Image.open(out / f"png/{name}.png") for name in names}
-    assert {image.size for image in images.values()} == {(1280, 720)}
-    assert Image.open(video).n_frames == len(names)
-    assert not (out / "detections.json").exists()  # not requested
-    first_times = {name: (out / f"png/{name}.png").stat().st_mtime_ns for name in names}
-    (out / f"png/{names[1]}.png").unlink()
-    assert detect(monkeypatch, drives, "--out", out, "--png", "--track", "--ego", "none") == 0
-    second_times = {name: (out / f"png/{name}.png").stat().st_mtime_ns for name in names}
-    assert [name for name in names if second_times[name] != first_times[name]] == [names[1]]
-    assert len(stand_in_calls) == len(names)
-
-
-def test_unsupported_video_is_rejected_before_any_work(drives, tmp_path, monkeypatch, capsys, stand_in_calls):
-    find_spec = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name, *more: None if name == "av" else find_spec(name, *more)
-    )
-    for name, message in ("a.mp4", "lidar_perception[video]"), ("a.avi", "is not a video"):
-        line = detect_with_error(monkeypatch, capsys, drives, "--out", tmp_path / "out", "--video", tmp_path / name)
-        assert message in line
-    assert stand_in_calls == [] and not (tmp_path / "out").exists()

@@ -75,12 +75,12 @@ def test_only_boxes_of_cars_are_moved_to_their_points(name, scans):
     for weight in (0.0, 1.0):
         detector.params = with_values(detector.params, {f"{name}.on_points": weight})
         results.append(detector(scans[0].frame).detections)
-    unmoved, moved = results
-    is_car = unmoved.class_ids == CAR
-    distances = np.hypot(*(moved.boxes - unmoved.boxes)[:, :2].T)
+    original_boxes, moved_boxes = results
+    is_car = original_boxes.class_ids == CAR
+    distances = np.hypot(*(moved_boxes.boxes - original_boxes.boxes)[:, :2].T)
     assert 0.02 < distances[is_car].max() <= MARGIN_M * 2**0.5 + 1e-5 and not distances[~is_car].any()
-    np.testing.assert_array_equal(moved.boxes[:, 3:], unmoved.boxes[:, 3:])
-    np.testing.assert_array_equal(moved.scores, unmoved.scores)
+    np.testing.assert_array_equal(moved_boxes.boxes[:, 3:], original_boxes.boxes[:, 3:])
+    np.testing.assert_array_equal(moved_boxes.scores, original_boxes.scores)
 
 
 def test_ego_vehicle_is_not_detected(data):

@@ -175,9 +175,9 @@ def test_tiny_budget_runs_end_to_end(tmp_path, coarse_drives, monkeypatch):
 
 def test_thinning_and_noise_are_reproducible(frames):
     cloud = frames[0].load()
-    half, again = (change_cloud(cloud, Change(fraction=0.5), "a") for _ in range(2))
+    half, second_half = (change_cloud(cloud, Change(fraction=0.5), "a") for _ in range(2))
     assert len(half) == pytest.approx(len(cloud) / 2, rel=0.2)
-    np.testing.assert_array_equal(half.xyz, again.xyz)
+    np.testing.assert_array_equal(half.xyz, second_half.xyz)
     noisy = change_cloud(cloud, Change(noise=0.05), "a")
     shift = np.linalg.norm(noisy.xyz, axis=1) - np.linalg.norm(cloud.xyz, axis=1)
     assert shift.std() == pytest.approx(0.05, rel=0.1)
@@ -190,11 +190,11 @@ def test_simulated_labels_have_velocities(coarse_drives):
     labels = [frame.native.labels() for frame in frames]
     speeds = np.linalg.norm(labels[1].boxes.velocities, axis=1)
     assert (speeds[np.isfinite(speeds)] > 2).any() and (speeds < 0.01).any()
-    moved = {i: centre for i, centre in zip(labels[2].instances, labels[2].boxes.centres)}
+    later_centres = {i: centre for i, centre in zip(labels[2].instances, labels[2].boxes.centres)}
     seconds = 1e-9 * (frames[2].stamp_ns - frames[0].stamp_ns)
     for i, centre, velocity in zip(labels[0].instances, labels[0].boxes.centres, labels[1].boxes.velocities):
-        if i in moved and i == labels[1].instances[list(labels[0].instances).index(i)]:
-            np.testing.assert_allclose((moved[i] - centre)[:2], velocity * seconds, atol=0.3)
+        if i in later_centres and i == labels[1].instances[list(labels[0].instances).index(i)]:
+            np.testing.assert_allclose((later_centres[i] - centre)[:2], velocity * seconds, atol=0.3)
 
 
 def test_drive_starts_at_the_first_frame_of_a_scene(coarse_drives, frames):
@@ -214,9 +214,9 @@ def test_boxes_get_the_velocities_of_their_tracks():
         found = Detections.of(box, [CAR], [0.9])
         tracks = tracker(found, 10**9 + i * 10**8, pose)
     boxes = GlobalBoxes.of([[-2, 5 + 0.8 * 11, 0], [30, 30, 0]], np.ones((2, 3)), np.eye(4)[:2], 0)
-    moved = add_velocities(boxes, tracks, pose)
-    assert moved.velocities[0] == pytest.approx([0, 8], abs=1.0)
-    assert moved.velocities[1].tolist() == [0, 0]
+    boxes_with_velocities = add_velocities(boxes, tracks, pose)
+    assert boxes_with_velocities.velocities[0] == pytest.approx([0, 8], abs=1.0)
+    assert boxes_with_velocities.velocities[1].tolist() == [0, 0]
 
 
 def test_boxes_survive_json_and_perfect_ones_have_a_score():

@@ -80,8 +80,8 @@ def copy_labels(frame, score=0.9) -> Detections:
 def test_all_detectors_run_and_missing_ones_are_listed(package_without_weights, weights, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
     root = write_crowd_folder(tmp_path / "kitti", 3)
-    given = [word for name in "acb" for word in ("--weights", weights / name)]
-    content, text = run(tmp_path, "--data", root, *given, "--device", "cpu")
+    options = [word for name in "acb" for word in ("--weights", weights / name)]
+    content, text = run(tmp_path, "--data", root, *options, "--device", "cpu")
     assert [*content["rows"]] == [*CANDIDATES, "PointPillars v0 compact", "PointNet", "PointPillars v0 compact #2"]
     assert {each["name"] for each in content["missing"]} == {"fused"} | {
         f"PointPillars v{i} {size}" for i in range(5) for size in ("full", "compact") if (i, size) != (0, "compact")

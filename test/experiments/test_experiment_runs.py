@@ -130,12 +130,12 @@ def test_killed_run_of_two_processes_resumes(crowd_recording, paper_run, tmp_pat
     process.wait()
     wait_for_the_end(process.pid)  # its child processes end by themselves
     assert "Traceback" not in process.communicate()[1]
-    kept = read_lines(out)
-    assert 4 <= len(kept)  # on a busy machine, all frames may be measured before the signal arrives
+    saved_lines = read_lines(out)
+    assert 4 <= len(saved_lines)  # on a busy machine, all frames may be measured before the signal arrives
     run_reproduce("--data", crowd_recording, "--out", out, "--jobs", 1)
     assert read_untimed_records(out) == read_untimed_records(paper_run)
     assert read_untimed_files(out) == read_untimed_files(paper_run)
-    assert set(kept[:4]) <= set(read_lines(out))  # equal durations: the frames were not measured again
+    assert set(saved_lines[:4]) <= set(read_lines(out))  # equal durations: the frames were not measured again
 
 
 @pytest.mark.parametrize("cut", [1, 2, 40])
@@ -249,8 +249,8 @@ def test_exception_in_an_experiment_ends_the_run(five_scans, tmp_path, jobs, cap
         forkserver._forkserver._stop()  # the server's processes still print to its original stderr
     with pytest.raises((ZeroDivisionError, InputError)) as error:
         run_experiment(make_small_experiment(raise_bug), open_recording(five_scans), tmp_path / "out", jobs=jobs)
-    said = capfd.readouterr().err + "".join(getattr(error.value, "__notes__", []))
-    assert "while processing frame 000002" in said
+    message = capfd.readouterr().err + "".join(getattr(error.value, "__notes__", []))
+    assert "while processing frame 000002" in message
     assert '"000002"' not in "".join(read_lines(tmp_path / "out"))
 
 

@@ -301,10 +301,10 @@ def test_median_within_real_interval_is_plausible():
 
 def test_comparison_survives_json_and_is_printed():
     content = compare_scans(measure_street(), measure_scans(map(make_scan, range(3)), PAPER))
-    again = json.loads(json.dumps(content, allow_nan=False))
-    assert again == content
+    parsed = json.loads(json.dumps(content, allow_nan=False))
+    assert parsed == content
     shown = StringIO()
-    print_realism(again, Console(file=shown, width=100))
+    print_realism(parsed, Console(file=shown, width=100))
     assert f"{content['within']} of {content['judged']} bins" in shown.getvalue()
 
 
@@ -352,12 +352,12 @@ def test_frames_of_large_folder_are_evenly_spaced(tmp_path):
 
 
 def test_command_writes_json(tmp_path):
-    root, made = write_object_folder(tmp_path / "kitti", make_walker_label(), 1), tmp_path / "made"
+    root, out = write_object_folder(tmp_path / "kitti", make_walker_label(), 1), tmp_path / "made"
     result = CliRunner().invoke(
-        command.realism, [str(root), "--frames", "1", "--json", str(made / "realism.json")], catch_exceptions=False
+        command.realism, [str(root), "--frames", "1", "--json", str(out / "realism.json")], catch_exceptions=False
     )
     assert result.exit_code == 0, result.output
-    content = json.loads((made / "realism.json").read_text())
+    content = json.loads((out / "realism.json").read_text())
     assert set(content["curves"]) == set(CURVES)
     assert content["real"]["scans"] == content["simulated"]["scans"] == 1
 

@@ -82,8 +82,8 @@ def test_best_f1_is_that_of_the_best_threshold(seed):
     truth = sum(hit for _, hit in pairs) + int(rng.integers(1, 4))
     best = 0.0
     for threshold in np.linspace(0, 1, 11):
-        kept = [hit for score, hit in pairs if score >= threshold - 1e-9]
-        best = max(best, 200 * sum(kept) / (len(kept) + truth))
+        hits = [hit for score, hit in pairs if score >= threshold - 1e-9]
+        best = max(best, 200 * sum(hits) / (len(hits) + truth))
     assert find_best_f1(ranked, truth) == pytest.approx(best)
 
 

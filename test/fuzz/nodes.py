@@ -121,9 +121,9 @@ class FedNode:
         self.node.start()
         self.inputs = INPUTS[name][1]
         self.calls = {s.topic_name.removeprefix(f"/{name}").lstrip("/"): s.callback for s in self.node.subscriptions}
-        for made in self.node.inputs.items:
-            if isinstance(made, Reception):  # delivers immediately, without the input queue
-                self.calls[made.topic.removeprefix(f"/{name}").lstrip("/")] = made.deliver
+        for item in self.node.inputs.items:
+            if isinstance(item, Reception):  # delivers immediately, without the input queue
+                self.calls[item.topic.removeprefix(f"/{name}").lstrip("/")] = item.deliver
         self.params: dict[str, Any] = {}
         self.sent: list[tuple[Any, bytes]] = []
         for publisher in self.node.publishers:

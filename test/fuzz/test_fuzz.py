@@ -45,9 +45,9 @@ def nodes(domain, tmp_path_factory):
         "pointnet_detector": {"pointnet.weights": clusters},
         "fused_detector": {"fused.weights": pillars, "fused.classifier": clusters},
     }
-    made = {name: FedNode(name, context, **values.get(name, {})) for name in INPUTS}
-    yield made
-    shut_down_context(context, *(each.node for each in made.values()))
+    nodes_by_name = {name: FedNode(name, context, **values.get(name, {})) for name in INPUTS}
+    yield nodes_by_name
+    shut_down_context(context, *(each.node for each in nodes_by_name.values()))
 
 
 def test_every_input_of_a_node_is_fuzzed(nodes):
@@ -129,8 +129,8 @@ def test_cases_depend_on_the_seed_only(monkeypatch):
     samples = {f"{name}/a.bin": bytes(99) for name in files.COMMANDS}
     monkeypatch.setattr(files, "load_samples", lambda: samples)
     for part in (messages, files, parameters):
-        first, again, other = ([part.make_case(seed, i) for i in range(30)] for seed in (5, 5, 6))
-        assert first == again != other
+        first, second, other = ([part.make_case(seed, i) for i in range(30)] for seed in (5, 5, 6))
+        assert first == second != other
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -51,23 +51,23 @@ REAL = {"kitti_object": "kitti", "kitti_tracking": "kitti-tracking", "semanticki
 
 def assert_equal_frames(recording, others, boxes=1e-5, points=0.0):
     for frame, other in zip(recording, others, strict=True):
-        scan, again = frame.load(), other.load()
-        np.testing.assert_allclose(again.xyz, scan.xyz, atol=points)
-        np.testing.assert_allclose(again.intensity, scan.intensity, atol=1e-6 * (points > 0))
-        assert again.stamp_ns == scan.stamp_ns
-        labels, again = frame.point_truth(), other.point_truth()
-        assert (labels is None) == (again is None)
+        scan, actual = frame.load(), other.load()
+        np.testing.assert_allclose(actual.xyz, scan.xyz, atol=points)
+        np.testing.assert_allclose(actual.intensity, scan.intensity, atol=1e-6 * (points > 0))
+        assert actual.stamp_ns == scan.stamp_ns
+        labels, actual = frame.point_truth(), other.point_truth()
+        assert (labels is None) == (actual is None)
         if labels is not None:
-            assert np.array_equal(again.classes, labels.classes)
-            assert np.array_equal(again.instances, labels.instances)
-        pose_before, again = frame.pose(), other.pose()
-        if pose_before is not None and again is not None:
-            np.testing.assert_allclose(again, pose_before, atol=1e-6)
-        truth, again = frame.truth(), other.truth()
-        assert (truth is None) == (again is None)
+            assert np.array_equal(actual.classes, labels.classes)
+            assert np.array_equal(actual.instances, labels.instances)
+        pose_before, actual = frame.pose(), other.pose()
+        if pose_before is not None and actual is not None:
+            np.testing.assert_allclose(actual, pose_before, atol=1e-6)
+        truth, actual = frame.truth(), other.truth()
+        assert (truth is None) == (actual is None)
         if truth is not None:
-            np.testing.assert_allclose(again.boxes, truth.boxes, atol=boxes)
-            assert again.labels == truth.labels and again.notes == truth.notes
+            np.testing.assert_allclose(actual.boxes, truth.boxes, atol=boxes)
+            assert actual.labels == truth.labels and actual.notes == truth.notes
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -111,10 +111,10 @@ def test_simulated_drive_survives_conversion_to_nuscenes(simulated_bag, tmp_path
     assert sum(len(frame.truth()) for frame in recording) == summary.boxes > 0
     tracks = {}
     for frame, other in zip(recording, back, strict=True):
-        scan, again = frame.load(), other.load()
+        scan, other_scan = frame.load(), other.load()
         away = (np.abs(scan.xyz[:, :2]) >= 1.0).any(axis=1)  # nearer points are on the vehicle
-        np.testing.assert_allclose(again.xyz, scan.xyz[away], atol=1e-5)
-        np.testing.assert_allclose(again.intensity, scan.intensity[away], atol=1e-6)
+        np.testing.assert_allclose(other_scan.xyz, scan.xyz[away], atol=1e-5)
+        np.testing.assert_allclose(other_scan.intensity, scan.intensity[away], atol=1e-6)
         np.testing.assert_allclose(other.pose(), frame.pose(), atol=1e-6)
         assert other.sensor_height == frame.sensor_height
         truth, labels = frame.truth(), read_frame_labels(other)

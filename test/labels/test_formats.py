@@ -36,10 +36,10 @@ def test_second_export_is_identical(format, name, tmp_path):
     export_labels(make_labels(frames, format), format, tmp_path / "first", frames)
     read = import_labels(tmp_path / "first", format, frames)
     export_labels(read, format, tmp_path / "second", frames)
-    again = import_labels(tmp_path / "second", format, frames)
-    assert_equal_labels(read, again, max(EXACT[format], 1e-9) if format == VERTICES else 1e-9)
-    assert read.extra == again.extra
-    for each, other in zip(read.frames, again.frames):
+    second_labels = import_labels(tmp_path / "second", format, frames)
+    assert_equal_labels(read, second_labels, max(EXACT[format], 1e-9) if format == VERTICES else 1e-9)
+    assert read.extra == second_labels.extra
+    for each, other in zip(read.frames, second_labels.frames):
         assert (each.extra, each.notes) == (other.extra, other.notes)
 
 

@@ -138,9 +138,9 @@ def test_video_has_every_picture_with_its_duration(name, tmp_path):
     if path.suffix in (".mp4", ".mkv"):
         pytest.importorskip("av", reason="needs PyAV, the extra [video]")
     check_video(path, 4)
-    with open_video(path, (160, 90)) as made:
+    with open_video(path, (160, 90)) as video:
         for k, picture in enumerate(make_pictures(4)):
-            made.add(picture, 0.1 if k else 0.3)
+            video.add(picture, 0.1 if k else 0.3)
         assert not path.exists()
     assert [p.name for p in path.parent.iterdir()] == [name]
     seen, times = read_video(path)
@@ -169,8 +169,8 @@ def test_failed_or_empty_video_leaves_no_file(tmp_path):
     for suffix in (".gif", *[".mp4"] * (importlib.util.find_spec("av") is not None)):
         with open_video(tmp_path / f"a{suffix}", (160, 90)):
             pass
-    with pytest.raises(ZeroDivisionError), open_video(tmp_path / "a.gif", (160, 90)) as made:
-        made.add(make_pictures(1)[0], 1 / 0)
+    with pytest.raises(ZeroDivisionError), open_video(tmp_path / "a.gif", (160, 90)) as video:
+        video.add(make_pictures(1)[0], 1 / 0)
     assert not [*tmp_path.iterdir()]
 
 

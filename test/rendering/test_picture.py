@@ -78,12 +78,12 @@ def test_order_of_points_and_boxes_does_not_matter(render_settings, seed):
 def test_point_colour_is_height_or_intensity(render_settings):
     scan = PointCloud(np.array([[15.0, 0, 1.0]], np.float32), np.array([0.9], np.float32))
     for color, expected in (("height", color_by_height(np.array([2.73]))[0]), ("intensity", None)):
-        made = RenderSettings(render_settings.reach, render_settings.ahead, render_settings.ground, color, *SIZE)
-        expected = made.color_points(scan)[0] if expected is None else expected
+        settings = RenderSettings(render_settings.reach, render_settings.ahead, render_settings.ground, color, *SIZE)
+        expected = settings.color_points(scan)[0] if expected is None else expected
         assert all(
             np.subtract(
-                count_pixels(draw_frame(made, scan, Boxes()), expected, 0),
-                count_pixels(draw_frame(made, EMPTY, Boxes()), expected, 0),
+                count_pixels(draw_frame(settings, scan, Boxes()), expected, 0),
+                count_pixels(draw_frame(settings, EMPTY, Boxes()), expected, 0),
             )
             > 0
         )

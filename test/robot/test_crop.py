@@ -110,10 +110,10 @@ def test_cropping_before_or_inside_the_pipeline_is_equivalent():
     """Indices refer to the given cloud, and a second crop removes nothing."""
     frame = PointCloud(np.ascontiguousarray(make_scene()[:, :3]))
     params = with_values(PipelineParams(), {"crop.min_range": 4.0, "crop.sectors": (90.0, 270.0)})
-    kept, before = crop_frame(frame, params.crop)
-    assert 0 < len(kept) < len(frame)
+    kept_rows, before = crop_frame(frame, params.crop)
+    assert 0 < len(kept_rows) < len(frame)
     whole, part = segment_cloud(frame, params=params), segment_cloud(before)
-    np.testing.assert_array_equal(whole.indices, kept.take(part.indices))
+    np.testing.assert_array_equal(whole.indices, kept_rows.take(part.indices))
     for name in ("xyz", "ground", "cluster_ids", "boxes"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(part, name))
     assert len(crop_frame(before, params.crop)[0]) == len(before)
@@ -125,9 +125,11 @@ def test_cropped_message_has_points_of_cropped_frame():
         cloud[name] = make_points(300)[:, i]
     cloud["x"][::7] = np.nan
     frame, usable = to_point_cloud(from_array(cloud, make_any_header(make_bag_message), make_bag_message))
-    kept, _ = crop_frame(frame, CROP)
+    kept_rows, _ = crop_frame(frame, CROP)
     finite = np.isfinite(cloud["x"])
-    np.testing.assert_array_equal(usable.take(kept), np.flatnonzero(finite & select_points(make_points(300), CROP)))
+    np.testing.assert_array_equal(
+        usable.take(kept_rows), np.flatnonzero(finite & select_points(make_points(300), CROP))
+    )
 
 
 @pytest.mark.parametrize(

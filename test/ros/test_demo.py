@@ -89,16 +89,16 @@ def test_real_time_demo_uses_the_input_queue_of_a_robot(drive_bag, tmp_path, mon
     ids=range(3),
 )
 def test_parameters_reach_the_nodes(drive_bag, tmp_path, monkeypatch, arguments, node, expected):
-    given = {}
+    values_by_node = {}
 
     def start(processes, name, remap, values):
-        given[name] = values
+        values_by_node[name] = values
         if name == "bag_recorder":
             raise InputError("enough")
 
     monkeypatch.setattr(graph_replay.Processes, "start", start)
     assert run_main(monkeypatch, "demo", drive_bag, *arguments, "--out", tmp_path / "out") == 2
-    assert expected.items() <= given[node].items()
+    assert expected.items() <= values_by_node[node].items()
 
 
 def test_demo_keeps_files_that_it_did_not_create(drive_bag, make_bag, tmp_path):

@@ -76,19 +76,19 @@ def test_cloud_of_moving_sensor_is_compensated(start_node, source):
     deliver_cloud(node, msg)
     assert "deskew" not in list_problems(node) and node.diagnostics.counts["deskewed"] == 1
     after = decode(node.sent["points"][-1], "sensor_msgs/msg/PointCloud2")
-    moved = np.column_stack([to_array(after)[n] for n in "xyz"])
+    compensated_xyz = np.column_stack([to_array(after)[n] for n in "xyz"])
     others = np.setdiff1d(np.arange(len(still)), body)
     wrong = np.linalg.norm(raw - still, axis=1)[others]
-    np.testing.assert_allclose(moved[others], still[others], atol=5e-3)
+    np.testing.assert_allclose(compensated_xyz[others], still[others], atol=5e-3)
     assert np.median(wrong) > 0.5
-    np.testing.assert_array_equal(moved[body], still[body])
+    np.testing.assert_array_equal(compensated_xyz[body], still[body])
     assert not read_column(after, "in_view", body).any() and not to_array(after)["t"].any()
     frame_, _ = to_point_cloud(after)
-    again = start_node(GroundSegmentation, **{"input.deskew": source})
-    again.transforms = node.transforms
-    deliver_cloud(again, after)
+    second_node = start_node(GroundSegmentation, **{"input.deskew": source})
+    second_node.transforms = node.transforms
+    deliver_cloud(second_node, after)
     np.testing.assert_array_equal(  # compensated only once
-        to_array(decode(again.sent["points"][-1], "sensor_msgs/msg/PointCloud2"))["x"], moved[:, 0]
+        to_array(decode(second_node.sent["points"][-1], "sensor_msgs/msg/PointCloud2"))["x"], compensated_xyz[:, 0]
     )
     deliver_cloud(node, make_robot_cloud(raw, START + PERIOD))
     assert "no time column" in list_problems(node) and len(node.sent["points"]) == 3
@@ -119,10 +119,10 @@ def test_later_clouds_wait_for_the_end_of_their_sweep(start_node, first, begin, 
     arrives every 0.02 s."""
     node = start_node(GroundSegmentation, **{"input.deskew": "odometry", "crop.sectors": sectors})
     deliver = node.inputs.receptions[0].deliver
-    heard = iter(range(START, START + 20 * PERIOD, PERIOD // 5))
+    odometry_stamps = iter(range(START, START + 20 * PERIOD, PERIOD // 5))
 
     def hear():
-        stamp = next(heard)
+        stamp = next(odometry_stamps)
         node.transforms.on_odometry(make_base_odometry(np.eye(4), stamp, "lidar"))
         return stamp
 

@@ -28,8 +28,8 @@ def load_launch_file(monkeypatch):
     install(monkeypatch)
 
     def load(name):
-        def nodes(**given):
-            launch = Launch(name, {"processes": "true"} | given)
+        def nodes(**arguments):
+            launch = Launch(name, {"processes": "true"} | arguments)
             nodes.messages = launch.messages
             return {n.name if n.executable == "tracker" else n.executable: n for n in launch.nodes}
 
@@ -68,8 +68,8 @@ def test_launch_file_starts_its_graph_or_single_detectors(name, load_launch_file
         if not node.name.endswith("_detector"):
             assert node.parameters[0] == config
     assert not any(node.respawn for node in started.values())
-    again = nodes(respawn="true", rviz="true", tracking="true")
-    assert all(node.respawn == (kind != "rviz2") for kind, node in again.items())
+    restarted = nodes(respawn="true", rviz="true", tracking="true")
+    assert all(node.respawn == (kind != "rviz2") for kind, node in restarted.items())
     for node in nodes(autostart="false").values():
         assert node.parameters[1] == {"autostart": False}  # other parameters are those of the file
     mine = str(ROOT / "config" / "best.param.yaml")
@@ -91,7 +91,7 @@ def test_launch_file_starts_its_graph_or_single_detectors(name, load_launch_file
 def test_graph_is_one_process_if_requested_or_on_few_cores(processes, cores, together, load_launch_file, monkeypatch):
     monkeypatch.setattr(graph_module, "count_cores", lambda: cores)
     nodes = load_launch_file("detectors")
-    given = dict(
+    arguments = dict(
         processes=processes,
         tracking="true",
         namespace="left",
@@ -100,10 +100,10 @@ def test_graph_is_one_process_if_requested_or_on_few_cores(processes, cores, tog
         log_level="debug",
         respawn="true",
     )
-    started = nodes(**given)
+    started = nodes(**arguments)
     graph = build_graph(["fused"], tracking=True)
     assert len(started) == (1 if together else len(graph))
-    assert len(nodes(**given | {"tracking": "false"}, single="true")) == 1
+    assert len(nodes(**arguments | {"tracking": "false"}, single="true")) == 1
     if not together:
         return
     (node,) = started.values()
@@ -111,7 +111,7 @@ def test_graph_is_one_process_if_requested_or_on_few_cores(processes, cores, tog
     parts, shared = split_arguments([node.executable, *node.arguments, "--ros-args", "-r", "a:=b"])
     assert [part[0] for part in parts] == [*graph] and shared == ["--ros-args", "-r", "a:=b"]
     for part, name in zip(parts, graph):
-        alone = nodes(**given | {"processes": "true"})[name]
+        alone = nodes(**arguments | {"processes": "true"})[name]
         options = list(zip(part[2::2], part[3::2]))
         assert [tuple(rule.split(":=")) for option, rule in options if option == "-r"] == [
             ("__node", name),
@@ -171,9 +171,13 @@ def test_arguments_override_user_file_and_defaults(load_launch_file, tmp_path):
         "left: {clustering: {ros__parameters: {clustering.density: 1.0}}}\n"
     )
     started = nodes(config=f"{ROOT}/config/best.param.yaml,{mine}", range="around")
-    *files, given, above = started["fused_detector"].parameters
+    *files, argument_values, argument_file = started["fused_detector"].parameters
     assert [Path(file).name for file in files] == ["fused.param.yaml", "best.param.yaml", "mine.yaml"]
-    assert read_sections(above) == {"/**/fused_detector": given} == {"/**/fused_detector": {"fused.range": "around"}}
+    assert (
+        read_sections(argument_file)
+        == {"/**/fused_detector": argument_values}
+        == {"/**/fused_detector": {"fused.range": "around"}}
+    )
     assert started["clustering"].parameters[1:] == files[1:]
     assert nodes.messages == []
 

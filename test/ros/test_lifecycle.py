@@ -91,7 +91,7 @@ def change_states(peer, node, *names):
 @pytest.fixture
 def make_local_node(peer):
     """Return a function that creates nodes in this process, so that the test can inspect their memory."""
-    made = []
+    nodes = []
 
     def make(kind, values, remap):
         rules = [word for a, b in remap.items() for word in ("-r", f"{a}:={b}")]
@@ -100,13 +100,13 @@ def make_local_node(peer):
             cli_args=["--ros-args", *rules],
             parameter_overrides=[Parameter(k, value=list(v) if isinstance(v, tuple) else v) for k, v in values.items()],
         )
-        made.append(node)
+        nodes.append(node)
         node.start()
         peer.executor.add_node(node)
         return node
 
     yield make
-    for node in made:
+    for node in nodes:
         peer.executor.remove_node(node)
         node.close()
         node.destroy_node()

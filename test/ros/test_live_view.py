@@ -51,9 +51,9 @@ class LiveView:
 
 @pytest.fixture(scope="module")
 def view(shared_processes, shared_peer):
-    made = LiveView(shared_processes)
-    shared_peer.wait(lambda: made.url, "the address of the page")
-    return made
+    live_view = LiveView(shared_processes)
+    shared_peer.wait(lambda: live_view.url, "the address of the page")
+    return live_view
 
 
 @pytest.fixture(scope="module")

@@ -153,9 +153,9 @@ for given in sys.argv[1:]:
         [sys.executable, "-c", program, *ARGUMENTS], text=True, capture_output=True, timeout=100, check=True
     )
     assert done.stdout.split() == ["2"] * len(ARGUMENTS)
-    for words, said in zip(ARGUMENTS.values(), done.stderr.split("---\n"), strict=False):
-        (fatal,) = [line for line in said.splitlines() if "[FATAL]" in line]
-        assert words in fatal and "[left.front]: " in fatal and "Traceback" not in said
+    for words, output in zip(ARGUMENTS.values(), done.stderr.split("---\n"), strict=False):
+        (fatal,) = [line for line in output.splitlines() if "[FATAL]" in line]
+        assert words in fatal and "[left.front]: " in fatal and "Traceback" not in output
 
 
 def test_unknown_parameter_is_reported(start_node):

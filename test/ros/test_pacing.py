@@ -85,8 +85,8 @@ def test_waiting_threads_sleep_by_default(own):
         "'torch' in sys.modules)); from lidar_perception.cli.main import main; main()"
     )
     environment = {k: v for k, v in os.environ.items() if k not in PASSIVE_WAITING} | own
-    said = subprocess.run(
+    output = subprocess.run(
         [sys.executable, "-c", program], env=environment, capture_output=True, text=True
     ).stdout.splitlines()[-1]
     expected = own or PASSIVE_WAITING
-    assert said == f"{[expected.get(k) for k in PASSIVE_WAITING]} False"
+    assert output == f"{[expected.get(k) for k in PASSIVE_WAITING]} False"

@@ -74,22 +74,22 @@ def test_bytes_of_the_bag_are_published_unchanged(processes, peer, drive_bag, tm
 
 
 def test_offset_duration_topics_and_remapping_take_effect(processes, peer, text_bag):
-    heard, note = peer.listen("/renamed", TEXT), peer.listen("/note", TEXT, LATCHED)
+    messages, note = peer.listen("/renamed", TEXT), peer.listen("/note", TEXT, LATCHED)
     start(
         processes, text_bag, start_offset=0.5, duration=1.0, remap=["/text:=renamed"], wait_for=["/renamed"], rate=10.0
     )
-    peer.wait(lambda: processes.has_ended("bag_player") and len(heard) >= 10 and note, "ten messages")
-    assert get_texts(heard) == [str(i) for i in range(5, 15)]
+    peer.wait(lambda: processes.has_ended("bag_player") and len(messages) >= 10 and note, "ten messages")
+    assert get_texts(messages) == [str(i) for i in range(5, 15)]
     assert get_texts(note) == ["latched"]  # although the offset skips it
     processes.check("bag_player")
 
 
 def test_latched_topic_reaches_a_late_subscriber(processes, peer, text_bag):
-    heard = peer.listen("/text", TEXT)
+    messages = peer.listen("/text", TEXT)
     start(processes, text_bag, start_paused=True)
     peer.wait(lambda: "playing" in peer.get_message("bag_player"), "the start")
     peer.call("/bag_player/resume", Trigger, Trigger.Request())
-    peer.wait(lambda: heard, "a message")
+    peer.wait(lambda: messages, "a message")
     peer.call("/bag_player/pause", Trigger, Trigger.Request())
     note = peer.listen("/note", TEXT, LATCHED)
     peer.wait(lambda: note, "the latched message")
@@ -174,25 +174,25 @@ def test_topic_of_several_publishers_offers_the_strictest_qos():
 
     poor, good = profile("BEST_EFFORT", "VOLATILE"), profile("RELIABLE", "TRANSIENT_LOCAL")
     for profiles, best in (([poor], False), ([good], True), ([poor, good], True)):
-        made = _make_qos(profiles, 1, lossless=False)
-        assert (made.reliability.name, made.durability.name) == (
+        qos = _make_qos(profiles, 1, lossless=False)
+        assert (qos.reliability.name, qos.durability.name) == (
             ("RELIABLE", "TRANSIENT_LOCAL") if best else ("BEST_EFFORT", "VOLATILE")
         )
 
 
 def test_pause_step_resume_and_rate_take_effect(processes, peer, text_bag):
-    heard = peer.listen("/text", TEXT)
+    messages = peer.listen("/text", TEXT)
     start(processes, text_bag, start_paused=True, rate=0.02)  # the remaining messages would take 85 s
     request = Trigger.Request()
     for expected in (["0"], ["0", "1"], ["0", "1", "2"]):
         assert peer.call("/bag_player/step", Trigger, request).success
-        peer.wait(lambda n=len(expected): len(heard) >= n, "the stepped message")
-        assert get_texts(heard) == expected
+        peer.wait(lambda n=len(expected): len(messages) >= n, "the stepped message")
+        assert get_texts(messages) == expected
     assert peer.call("/bag_player/resume", Trigger, request).success
     assert not peer.call("/bag_player/step", Trigger, request).success  # only while paused
     peer.set_parameter("/bag_player", "rate", 5.0)
-    peer.wait(lambda: len(heard) == 20, "the rest")
-    assert get_texts(heard) == [str(i) for i in range(20)]
+    peer.wait(lambda: len(messages) == 20, "the rest")
+    assert get_texts(messages) == [str(i) for i in range(20)]
 
 
 def test_bag_time_follows_the_rate_and_stops_while_paused(monkeypatch):
@@ -233,13 +233,13 @@ def test_clock_keeps_its_rate_between_rare_messages(monkeypatch):
 
 
 def test_clock_follows_a_looped_bag(processes, peer, text_bag):
-    heard, clock = peer.listen("/text", TEXT), peer.listen("/clock", "rosgraph_msgs/msg/Clock")
+    messages, clock = peer.listen("/text", TEXT), peer.listen("/clock", "rosgraph_msgs/msg/Clock")
     start(processes, text_bag, loop=True, rate=3.0, clock_hz=200.0)
-    peer.wait(lambda: len(heard) > 45, "two and a half rounds")
-    numbers = np.array(get_texts(heard), int)
-    again = np.flatnonzero(np.diff(numbers) < 0)  # so that even a busy subscriber notices every round
-    assert 2 <= len(again) <= 3 and (np.diff(numbers) != 0).all()
-    assert (numbers[again] > 14).all() and (numbers[again + 1] < 5).all()
+    peer.wait(lambda: len(messages) > 45, "two and a half rounds")
+    numbers = np.array(get_texts(messages), int)
+    restarts = np.flatnonzero(np.diff(numbers) < 0)  # so that even a busy subscriber notices every round
+    assert 2 <= len(restarts) <= 3 and (np.diff(numbers) != 0).all()
+    assert (numbers[restarts] > 14).all() and (numbers[restarts + 1] < 5).all()
     times = np.array([to_ns(c.clock) for c in clock])
     assert (times >= START).all() and (times <= START + 25 * STEP).all()
     back = np.diff(times) < 0
@@ -260,15 +260,15 @@ def test_player_waits_until_a_subscriber_is_matched(processes, peer, text_bag):
     lost."""
     me = peer.node.get_name()
     between = f"/{me}/output/between"
-    said = peer.advertise("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+    diagnostics = peer.advertise("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
     peer.advertise(f"/{me}/debug/processing_time_ms", "std_msgs/msg/Float64")
     peer.advertise(between, TEXT)
     peer.listen(between, TEXT)
-    heard = peer.listen("/text", TEXT)
+    messages = peer.listen("/text", TEXT)
 
     def tell(count, until, what):
         peer.send(
-            said,
+            diagnostics,
             DiagnosticArray(
                 status=[DiagnosticStatus(name=me, values=[KeyValue(key=f"subscribers of {between}", value=count)])]
             ),
@@ -280,8 +280,8 @@ def test_player_waits_until_a_subscriber_is_matched(processes, peer, text_bag):
     peer.wait(lambda: peer.get_value("bag_player", "subscribers of /text") == "1", "the player")
     peer.diagnostics.clear()
     tell("0", lambda: "bag_player" in peer.diagnostics, "the player's next diagnostic")
-    assert peer.get_message("bag_player") == WAITING and heard == []
-    tell("1", lambda: len(heard) == 20, "all messages")
+    assert peer.get_message("bag_player") == WAITING and messages == []
+    tell("1", lambda: len(messages) == 20, "all messages")
 
 
 BAD = {

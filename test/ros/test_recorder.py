@@ -72,11 +72,11 @@ def test_slow_recorder_drops_and_reports_messages(monkeypatch, start_node, tmp_p
     monkeypatch.setattr(bag_recorder, "MAX_QUEUED_BYTES", 100)
     held = threading.Event()
     monkeypatch.setattr(bag_recorder.BagWriter, "write", lambda *_: held.wait())
-    kept = []
+    stamps = []
     monkeypatch.setattr(
         bag_recorder.BagRecorder,
         "create_subscription",
-        lambda self, kind, topic, received, *_, **__: kept.append(received),
+        lambda self, kind, topic, received, *_, **__: stamps.append(received),
     )
     node = start_node(
         bag_recorder.BagRecorder, **{"bag": str(tmp_path / "bag"), "topics": ["/a"], "use_sim_time": True}
@@ -85,7 +85,7 @@ def test_slow_recorder_drops_and_reports_messages(monkeypatch, start_node, tmp_p
     node._subscribe("/a")
     try:
         for _ in range(10):
-            kept[-1](bytes(40))
+            stamps[-1](bytes(40))
         assert node.diagnostics.counts["frames"] == 2 and node.diagnostics.counts["dropped"] == 8
         node._discover()
         assert "8 dropped" in node.diagnostics.state[1]

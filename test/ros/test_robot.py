@@ -78,7 +78,7 @@ def test_tilted_sensor_gets_its_mount_from_tf(processes, peer):
     transform."""
     pytest.importorskip("tf2_msgs", reason="the wheels of the pip environment lack tf2_msgs")
     base = mount_pose(0.5, 0.2, 1.7, 0.0, 0.3, -0.2)
-    moved = mount_pose(30.0, -4.0, 0.0, 0.0, 0.0, 0.0)
+    base_pose = mount_pose(30.0, -4.0, 0.0, 0.0, 0.0, 0.0)
     xyz, person = make_walker(base)
     processes.start("perception", {"~/input/points": "/in"}, {**WALKING, "base_frame": "base", "target_frame": "odom"})
     static = peer.advertise("/tf_static", TF_MESSAGE, STATIC_QOS)
@@ -87,7 +87,7 @@ def test_tilted_sensor_gets_its_mount_from_tf(processes, peer):
     click = peer.advertise("/clicked_point", "geometry_msgs/msg/PointStamped")
     found = peer.listen("/perception/output/detections", MARKERS)
     talker = peer.advertise("/in", CLOUD)
-    at = (person + moved[:3, 3]).tolist()
+    at = (person + base_pose[:3, 3]).tolist()
     peer.send(
         click,
         make_bag_message(
@@ -98,7 +98,7 @@ def test_tilted_sensor_gets_its_mount_from_tf(processes, peer):
         click.get_subscription_count,
         "a subscriber of the click",
     )
-    early, late = (transforms(("odom", "base", moved, START + i * PERIOD)) for i in (-1, 1))
+    early, late = (transforms(("odom", "base", base_pose, START + i * PERIOD)) for i in (-1, 1))
     peer.send(moving, early, moving.get_subscription_count, "a subscriber of /tf")
     peer.send(
         talker,

@@ -207,7 +207,7 @@ def test_missing_frames_are_reported_and_parameters_used(start_node):
     for node in plain, asks:
         deliver_cloud(node, make_robot_cloud(xyz))
     assert asks.sent["detections"] == plain.sent["detections"]
-    said = list_problems(asks)
+    problems = list_problems(asks)
     for words in (
         "base_frame 'base_footprint'",
         "'lidar' is not in TF",
@@ -215,7 +215,7 @@ def test_missing_frames_are_reported_and_parameters_used(start_node):
         "target_frame 'odom'",
         "results are in 'lidar'",
     ):
-        assert words in said
+        assert words in problems
     assert "frame" not in list_problems(plain)
     asks.transforms.on_tf(
         transforms(

@@ -162,19 +162,19 @@ def test_costmap_gets_the_obstacles_of_each_cloud(processes, peer, drive_bag):
     with Bag(drive_bag) as bag:
         cloud = next(m for _, _, m in bag.messages({POINTS}))
     band = {"obstacles.min_height": 0.2, "obstacles.max_height": 2.5}
-    heard = {}
+    messages = {}
     for node in ("ground_segmentation", "perception"):
         processes.start(node, {"~/input/points": "/in"}, band)
-        heard[node] = peer.listen(f"/{node}/output/obstacles", CLOUD, NAV2_QOS)
+        messages[node] = peer.listen(f"/{node}/output/obstacles", CLOUD, NAV2_QOS)
     talker = peer.advertise("/in", CLOUD)
     peer.wait(lambda: talker.get_subscription_count() == 2, "both nodes")
-    peer.send(talker, cloud, lambda: all(heard.values()), "obstacles of both")
+    peer.send(talker, cloud, lambda: all(messages.values()), "obstacles of both")
     frame, indices = to_point_cloud(cloud)
     ground = segment_ground(frame)
     chosen = find_obstacles(frame.xyz, ground, ObstacleParams(0.2, 2.5))
     assert 0 < chosen.sum() < (~ground).sum()
     sent = to_array(cloud)[indices[chosen]]
-    for message, *_ in heard.values():
+    for message, *_ in messages.values():
         assert [(f.name, f.datatype) for f in message.fields] == [(name, 7) for name in ("x", "y", "z", "intensity")]
         assert message.header == cloud.header
         np.testing.assert_array_equal(to_array(message), sent)

@@ -92,7 +92,7 @@ def looped_messages(domain, drive_bag, tmp_path_factory):
     with Bag(drive_bag) as bag:
         clouds = bag.counts[POINTS]
     with NodesUnderTest(tmp_path_factory.mktemp("looped"), domain) as processes, Peer(domain) as peer:
-        heard = {name: peer.listen(topic, MARKERS, ALL_OF_THEM) for name, topic in outputs.items()}
+        messages = {name: peer.listen(topic, MARKERS, ALL_OF_THEM) for name, topic in outputs.items()}
         for node, remap in graph.items():
             extra = {**flatten(params), "tracking.enabled": True, "input.queue": 2} if node == "perception" else {}
             processes.start(node, {**remap, **ODOMETRY_INPUT}, {**extra, "ego.max_wait": 60.0})
@@ -121,10 +121,10 @@ def looped_messages(domain, drive_bag, tmp_path_factory):
                 "wait_timeout": 120.0,
             },
         )
-        peer.wait(lambda: min(map(len, heard.values())) > 2.5 * clouds, "the drive, three times", 300.0)
+        peer.wait(lambda: min(map(len, messages.values())) > 2.5 * clouds, "the drive, three times", 300.0)
         processes.check()
         diagnostics = {key: peer.get_value(NODE, key) for key in ("alive", "born", "ended")}
-    return clouds, heard, diagnostics
+    return clouds, messages, diagnostics
 
 
 def assert_tracked(frames, messages, poses, params):
@@ -143,11 +143,11 @@ def assert_tracked(frames, messages, poses, params):
 
 
 def test_graph_tracks_equal_library_tracks_and_end_on_loop(looped_messages, drive_bag):
-    clouds, heard, diagnostics = looped_messages
+    clouds, messages, diagnostics = looped_messages
     poses = read_poses(drive_bag)
-    stamps = [from_marker_array(m).stamp_ns for m in heard["found"]]
+    stamps = [from_marker_array(m).stamp_ns for m in messages["found"]]
     assert len(poses) == clouds and stamps[: 2 * clouds] == 2 * sorted(poses)
-    shown = assert_tracked(heard["found"], heard["behind"], poses, TrackingParams())
+    shown = assert_tracked(messages["found"], messages["behind"], poses, TrackingParams())
     rounds = [
         {i for t in shown[start : start + clouds] if t is not None for i in t.ids.tolist()} for start in (0, clouds)
     ]
@@ -156,11 +156,11 @@ def test_graph_tracks_equal_library_tracks_and_end_on_loop(looped_messages, driv
 
 
 def test_ids_follow_the_people_of_the_drive(looped_messages, drive_bag):
-    clouds, heard, _ = looped_messages
+    clouds, messages, _ = looped_messages
     with Bag(drive_bag) as bag:
         truth = {o.stamp_ns: to_truth(o) for o in (from_marker_array(m) for _, _, m in bag.messages({TRUTH}))}
     report = TrackingReport()
-    for i, message in enumerate(heard["behind"][:clouds]):
+    for i, message in enumerate(messages["behind"][:clouds]):
         stamp, ids, found, _ = read_tracks(message)
         report.update(make_observation("drive", i, truth[stamp], to_tracked_labels(np.array(ids), found)))
     people = report.compute()["classes"]["Pedestrian"]
@@ -169,8 +169,8 @@ def test_ids_follow_the_people_of_the_drive(looped_messages, drive_bag):
 
 def test_tracker_inside_the_detector_equals_the_library(looped_messages, drive_bag):
     """Each cloud waits for its pose, like the frames of a tracker node."""
-    _, heard, _ = looped_messages
-    shown = assert_tracked(heard["found"], heard["inside"], read_poses(drive_bag), TrackingParams())
+    _, messages, _ = looped_messages
+    shown = assert_tracked(messages["found"], messages["inside"], read_poses(drive_bag), TrackingParams())
     assert any(t is not None and len(t) for t in shown)
 
 

@@ -61,19 +61,19 @@ def result_folder(tmp_path):
 @pytest.fixture
 def detector(monkeypatch):
     """Replace the detector of a checkpoint by made.find and record the calls in made.asked."""
-    made = types.SimpleNamespace(asked=[], scans=[], find=lambda frame: Detections.none())
+    stand_in = types.SimpleNamespace(asked=[], scans=[], find=lambda frame: Detections.none())
 
     def open_detector(path, device="auto", *, min_score=None, sensor_height=None, range="auto", settings=None):
-        made.asked.append((str(path), device, min_score, sensor_height))
+        stand_in.asked.append((str(path), device, min_score, sensor_height))
 
         def detect(frame):
-            made.scans.append(frame)
-            return DetectionResult(made.find(frame))
+            stand_in.scans.append(frame)
+            return DetectionResult(stand_in.find(frame))
 
         return detect
 
     monkeypatch.setattr("lidar_perception.detectors.open.open_detector", open_detector)
-    return made
+    return stand_in
 
 
 def read_truth(kitti):
@@ -142,20 +142,20 @@ def test_checkpoint_is_evaluated_on_every_scan(kitti, detector, tmp_path):
 
 
 def test_thinning_to_a_fraction_is_repeatable(kitti, detector, tmp_path):
-    kept = {}
+    thinned_scans = {}
     for share in (1, 0.1, 0.1):
         detector.scans.clear()
         content, _ = evaluate(tmp_path, "--data", kitti, "--weights", "w", "--keep", share)
         assert content["keep"] == share
         points = [np.column_stack([scan.xyz, scan.intensity]) for scan in detector.scans]
-        for now, before in zip(points, kept.get(share, points), strict=True):
+        for now, before in zip(points, thinned_scans.get(share, points), strict=True):
             np.testing.assert_array_equal(now, before)
-        kept[share] = points
-    for frame, whole, tenth in zip(open_recording(kitti).frames, kept[1], kept[0.1], strict=True):
+        thinned_scans[share] = points
+    for frame, whole, tenth in zip(open_recording(kitti).frames, thinned_scans[1], thinned_scans[0.1], strict=True):
         np.testing.assert_array_equal(whole[:, :3], frame.load().xyz)
         assert abs(len(tenth) / len(whole) - 0.1) < 0.03
         assert set(map(tuple, tenth)) < set(map(tuple, whole))
-    assert len(kept[0.1][0]) != len(kept[0.1][1])  # each frame has its own random numbers
+    assert len(thinned_scans[0.1][0]) != len(thinned_scans[0.1][1])  # each frame has its own random numbers
 
 
 def test_smaller_fraction_is_a_subset_of_a_larger_one(kitti):
@@ -194,15 +194,15 @@ def test_result_files_have_the_detections(tmp_path):
         ]
     )
     boxes[0, 0] = -30  # behind the camera: no 2D box
-    made = Detections.of(boxes, rng.integers(0, 6, 20), rng.uniform(-2, 1, 20))
+    detections = Detections.of(boxes, rng.integers(0, 6, 20), rng.uniform(-2, 1, 20))
     path = tmp_path / "000000.txt"
-    write_results(path, made, CALIBRATION)
+    write_results(path, detections, CALIBRATION)
     back = read_results(path, CALIBRATION.lidar_to_camera)
-    np.testing.assert_array_equal(back.class_ids, made.class_ids)
+    np.testing.assert_array_equal(back.class_ids, detections.class_ids)
     # LiDAR and camera are tilted by one degree to each other, and files have upright boxes only.
-    np.testing.assert_allclose(back.boxes[:, :6], made.boxes[:, :6], atol=2e-4)
-    np.testing.assert_allclose(np.cos(back.boxes[:, 6] - made.boxes[:, 6]), 1, atol=1e-4)
-    np.testing.assert_allclose([e["score"] for e in back.extras], made.scores, atol=1e-4)
+    np.testing.assert_allclose(back.boxes[:, :6], detections.boxes[:, :6], atol=2e-4)
+    np.testing.assert_allclose(np.cos(back.boxes[:, 6] - detections.boxes[:, 6]), 1, atol=1e-4)
+    np.testing.assert_allclose([e["score"] for e in back.extras], detections.scores, atol=1e-4)
     assert back.extras[0]["bbox"] == [0] * 4 and max(back.extras[1]["bbox"]) > 0
     assert {(e["truncated"], e["occluded"]) for e in back.extras} == {(-1, -1)}
     write_results(path, Detections.none(), CALIBRATION)

@@ -35,24 +35,24 @@ def root(tmp_path):
 def make_detections(frame, seed=0):
     """Labelled objects of the detected classes, slightly displaced, and a Van."""
     truth, rng = frame.truth(), np.random.default_rng(seed)
-    kept = np.isin(truth.class_ids, [CLASSES.index(name) for name in NAME_BY_CLASS])
-    kept &= np.array([extras["points"] > 0 for extras in truth.extras])
-    near = truth.boxes[kept] + rng.normal(0, 0.05, 7)
-    ids = truth.class_ids[kept]
+    is_kept = np.isin(truth.class_ids, [CLASSES.index(name) for name in NAME_BY_CLASS])
+    is_kept &= np.array([extras["points"] > 0 for extras in truth.extras])
+    near = truth.boxes[is_kept] + rng.normal(0, 0.05, 7)
+    ids = truth.class_ids[is_kept]
     return Detections.of(np.vstack([near, near[:1]]), [*ids, CLASSES.index("Van")], rng.uniform(0.1, 1, len(near) + 1))
 
 
 @pytest.fixture
 def detector(monkeypatch):
     """Stand-in for the detector of a checkpoint."""
-    made = types.SimpleNamespace(asked=[], find=lambda scan: Detections.none())
+    stand_in = types.SimpleNamespace(asked=[], find=lambda scan: Detections.none())
 
     def opened(path, device, *, min_score, sensor_height, range, settings):
-        made.asked.append((path, device, min_score, sensor_height))
-        return lambda scan: DetectionResult(made.find(scan))
+        stand_in.asked.append((path, device, min_score, sensor_height))
+        return lambda scan: DetectionResult(stand_in.find(scan))
 
     monkeypatch.setattr("lidar_perception.detectors.open.open_detector", opened)
-    return made
+    return stand_in
 
 
 def evaluate(tmp_path, *arguments):
@@ -128,8 +128,8 @@ def test_result_file_survives_writing_and_reading(root, tmp_path):
 def test_only_the_best_boxes_of_a_frame_are_written(root):
     frame, rng = open_nuscenes(root)[0], np.random.default_rng(0)
     scores = rng.uniform(0, 1, MAX_BOXES + 50)
-    made = to_results(Detections.of(np.ones((len(scores), 7)), 0, scores), frame)
-    assert len(made) == MAX_BOXES and made.scores.min() > np.sort(scores)[49]
+    results = to_results(Detections.of(np.ones((len(scores), 7)), 0, scores), frame)
+    assert len(results) == MAX_BOXES and results.scores.min() > np.sort(scores)[49]
     broken = Detections.of(np.full((1, 7), np.nan), 0)
     with pytest.raises(InputError, match=r"scene-0103/00: a box or score .* not finite"):
         to_results(broken, frame)

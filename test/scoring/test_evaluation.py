@@ -199,9 +199,9 @@ def raise_cut_frame():
 
 
 def make_truth(*centres, label="Pedestrian"):
-    made = make_boxes(*centres)
-    made[:, 3:6] = [0.6, 0.8, 1.75]
-    return GroundTruth.of(made, [CLASSES.index(label)] * len(made))
+    truth_boxes = make_boxes(*centres)
+    truth_boxes[:, 3:6] = [0.6, 0.8, 1.75]
+    return GroundTruth.of(truth_boxes, [CLASSES.index(label)] * len(truth_boxes))
 
 
 def evaluate_frames(frames, source="ground_truth"):

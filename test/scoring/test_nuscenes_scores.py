@@ -44,8 +44,8 @@ def make_boxes(*centres, kind="car", scores=0.0, yaw=0.0, **columns):
 
 
 def compute_class_scores(truth, found, kind="car", true_frames=None, found_frames=None):
-    def numbers(given, of):
-        return np.zeros(len(of), int) if given is None else np.array(given)
+    def numbers(frames, of):
+        return np.zeros(len(of), int) if frames is None else np.array(frames)
 
     return score_class(kind, truth, numbers(true_frames, truth), found, numbers(found_frames, found))
 
@@ -151,20 +151,20 @@ def test_error_is_averaged_over_recall_levels():
 def test_objects_beyond_the_range_of_their_class_do_not_count(kind):
     there = np.array([100.0, 50.0])
     away = RANGES[kind]
-    kept = select_scored_boxes(
+    is_selected = select_scored_boxes(
         make_boxes(*(there + [away * s, 0] for s in (0.999, 1, -0.999, 1.2)), kind=kind),
         np.array([100, 50, 7]),
         make_boxes(),
     )
-    assert kept.tolist() == [True, False, True, False]
+    assert is_selected.tolist() == [True, False, True, False]
     assert (RANGES["car"], RANGES["pedestrian"], RANGES["barrier"]) == (50, 40, 30)
 
 
 def test_empty_labels_and_bicycles_in_racks_do_not_count():
     rack = make_boxes((0, 0), yaw=math.pi / 2)  # 2 m along x, 4 m along y
     for kind, inside in ("bicycle", False), ("motorcycle", False), ("pedestrian", True):
-        kept = select_scored_boxes(make_boxes((0.9, 1.9), (1.9, 0.9), kind=kind), np.zeros(3), rack)
-        assert kept.tolist() == [inside, True]
+        is_selected = select_scored_boxes(make_boxes((0.9, 1.9), (1.9, 0.9), kind=kind), np.zeros(3), rack)
+        assert is_selected.tolist() == [inside, True]
     assert select_scored_boxes(
         make_boxes((0, 0), (1, 0), (2, 0), points=[0, 3, -1]), np.zeros(3), make_boxes()
     ).tolist() == [False, True, True]
@@ -252,13 +252,13 @@ def test_scores_do_not_depend_on_the_global_frame(tmp_path):
     results = folder.make_results(TABLES, CATEGORIES)
     before = compute_report(folder.save(tmp_path / "a", TABLES, sweeps=False), results)
     tables, turn = copy.deepcopy(TABLES), folder.Rotation.from_euler("z", 1.1)
-    moved = copy.deepcopy(results)
-    for row in [*tables["ego_pose"], *tables["sample_annotation"], *itertools.chain(*moved.values())]:
+    moved_results = copy.deepcopy(results)
+    for row in [*tables["ego_pose"], *tables["sample_annotation"], *itertools.chain(*moved_results.values())]:
         row["rotation"] = folder.to_wxyz(turn * folder.to_rotation(row))
         row["translation"] = (turn.apply(row["translation"]) + [30, -200, 0]).tolist()
         if "velocity" in row:
             row["velocity"] = turn.apply([*row["velocity"], 0])[:2].tolist()
-    after = compute_report(folder.save(tmp_path / "b", tables, sweeps=False), moved)
+    after = compute_report(folder.save(tmp_path / "b", tables, sweeps=False), moved_results)
     for key in "all", "ours":
         assert after[key] == pytest.approx(before[key], abs=1e-6)
 

@@ -72,8 +72,8 @@ def to_plain_frames(sequences):
 def count_sequences(sequences):
     hota, clear = HotaCounts(), ClearCounts()
     for frames in sequences:
-        kept = [drop_ignored(f) for f in frames]
-        hota, clear = hota + count_hota(kept), clear + count_clear(kept)
+        scored_frames = [drop_ignored(f) for f in frames]
+        hota, clear = hota + count_hota(scored_frames), clear + count_clear(scored_frames)
     return hota.compute_scores(), clear
 
 
@@ -186,8 +186,8 @@ def test_frames_without_pose_are_counted_and_reported(capsys):
         )
         print_tracking_report({"ego": ego, **report.compute()}, Console(width=200))
         assert report.compute()["without_pose"] == unknown
-        said = capsys.readouterr().out
-        assert ("no pose: 2 of 3 frames" in said and "--ego kiss_icp" in said) == bool(unknown)
+        output = capsys.readouterr().out
+        assert ("no pose: 2 of 3 frames" in output and "--ego kiss_icp" in output) == bool(unknown)
 
 
 def test_neighbour_classes_and_truncated_labels_are_ignored():
@@ -269,7 +269,7 @@ def test_result_file_survives_writing_and_reading(tmp_path):
     found = read_tracking_labels(path, FORWARD_CAMERA.lidar_to_camera)
     assert " Person " in path.read_text()  # name of Person_sitting in the tracking benchmark
     for number, _, detections in frames:
-        again = found[number]
-        np.testing.assert_allclose(again.boxes, detections.boxes, atol=2e-6)
-        assert again.class_ids.tolist() == detections.class_ids.tolist()
-        assert [(e["track_id"], e["score"]) for e in again.extras] == [(4, 0.25), (9, 0.75)]
+        read_tracks = found[number]
+        np.testing.assert_allclose(read_tracks.boxes, detections.boxes, atol=2e-6)
+        assert read_tracks.class_ids.tolist() == detections.class_ids.tolist()
+        assert [(e["track_id"], e["score"]) for e in read_tracks.extras] == [(4, 0.25), (9, 0.75)]

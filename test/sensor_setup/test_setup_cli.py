@@ -20,10 +20,10 @@ from lidar_perception.types import InputError
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
     path = tmp_path_factory.mktemp("bags") / "drive"
-    with BagWriter(path) as made:
-        made.add_topic("/lidar/points", "sensor_msgs/msg/PointCloud2")
+    with BagWriter(path) as writer:
+        writer.add_topic("/lidar/points", "sensor_msgs/msg/PointCloud2")
         for i, msg in enumerate(simulate_clouds("vlp-16", 6)):
-            made.write("/lidar/points", i * 10**8, msg)
+            writer.write("/lidar/points", i * 10**8, msg)
     return path
 
 

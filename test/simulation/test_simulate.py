@@ -66,8 +66,8 @@ def test_failed_data_set_is_marked_and_resumed(simulated_data_sets, tmp_path, mo
     result = run_simulate(out, layout, 5, 1, "--streets-of", 2, "--resume")
     assert result.exit_code == 0 and "3 of them from the interrupted run" in result.output
     assert read_files(out) == read_files(simulated_data_sets / layout)
-    again = run_simulate(out, layout, 5, 1, "--streets-of", 2, "--resume")
-    assert again.exit_code == 0 and "is already complete" in again.output
+    resumed_run = run_simulate(out, layout, 5, 1, "--streets-of", 2, "--resume")
+    assert resumed_run.exit_code == 0 and "is already complete" in resumed_run.output
     assert read_files(out) == read_files(simulated_data_sets / layout)
 
 
@@ -119,8 +119,8 @@ def test_killed_command_leaves_no_process_and_resumes(start, tmp_path):
     assert (out / "INCOMPLETE").exists()
     (out / "training/velodyne/0000/.000299.bin.1-0.tmp").write_bytes(b"half")  # as after a kill
     assert 3 <= len(list(out.glob(".parts/*.json"))) < frames
-    again = run_simulate(out, "kitti-tracking", frames, 1, "--streets-of", 30, "--resume")
-    assert again.exit_code == 0
+    resumed_run = run_simulate(out, "kitti-tracking", frames, 1, "--streets-of", 30, "--resume")
+    assert resumed_run.exit_code == 0
     assert run_simulate(tmp_path / "whole", "kitti-tracking", frames, 1, "--streets-of", 30).exit_code == 0
     assert read_files(out) == read_files(tmp_path / "whole")
     assert len(open_recording(out)) == frames
@@ -204,11 +204,11 @@ def test_existing_files_are_kept_without_force(simulated_data_sets, tmp_path):
 def test_recorded_command_reproduces_data_set(tmp_path):
     sensor = tmp_path / "my sensor.yaml"
     sensor.write_text("elevations: [2, -8]\nazimuth_step: 5\nrate: 10\nheight: 12.3456789\n")
-    made, again = tmp_path / "made", tmp_path / "again"
+    first, second = tmp_path / "made", tmp_path / "again"
     invoke(
         [
             "--out",
-            str(made),
+            str(first),
             "--format",
             "kitti",
             "--sensor",
@@ -221,11 +221,11 @@ def test_recorded_command_reproduces_data_set(tmp_path):
             "1.23456789",
         ]
     )
-    command = json.loads((made / "dataset.json").read_text())["command"]
+    command = json.loads((first / "dataset.json").read_text())["command"]
     program, name, *options = shlex.split(command)
     assert (program, name) == ("lidar-perception", "simulate")
-    invoke([*options, "--out", str(again), "--jobs", "1"])
-    assert read_files(again) == read_files(made)
+    invoke([*options, "--out", str(second), "--jobs", "1"])
+    assert read_files(second) == read_files(first)
 
 
 def test_run_with_changed_sensor_file_is_not_resumed(tmp_path):

@@ -83,8 +83,8 @@ def test_road_sidewalk_and_grass_have_separate_classes():
 
 def test_bumps_are_bounded_and_the_same_in_every_scan():
     rough = FULL._replace(tuft_height=0.08, litter_height=0.04)
-    (xyz, semantic, _, _), (again, *_) = cast_on_ground(rough), cast_on_ground(rough)
-    assert np.array_equal(xyz, again)
+    (xyz, semantic, _, _), (second_xyz, *_) = cast_on_ground(rough), cast_on_ground(rough)
+    assert np.array_equal(xyz, second_xyz)
     error = xyz[:, 2] - compute_ground_height(rough, xyz[:, 0], xyz[:, 1])
     for has_class, max_height in ((semantic == 72, 0.08), (semantic == 40, 0.008), (semantic == 44, 0.04)):
         near = has_class & (np.linalg.norm(xyz[:, :2], axis=1) < 20)

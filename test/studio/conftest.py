@@ -34,8 +34,8 @@ def labels(drive_bag, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def first_page(browser, labels):
-    with open_page(browser, labels.url) as made:
-        yield made
+    with open_page(browser, labels.url) as opened_page:
+        yield opened_page
 
 
 @pytest.fixture

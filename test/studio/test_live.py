@@ -51,11 +51,11 @@ def boxes(stamp, frame_id="velodyne", x=5.0, ids=(3,)):
 
 @pytest.fixture
 def live():
-    made = LiveGraph("test", max_frames=5)
-    made.expect_topic(FOUND, BOXES)
-    made.events = []
-    made.listeners.append(made.events.append)
-    return made
+    graph = LiveGraph("test", max_frames=5)
+    graph.expect_topic(FOUND, BOXES)
+    graph.events = []
+    graph.listeners.append(graph.events.append)
+    return graph
 
 
 def list_shown_frames(live):
@@ -95,12 +95,12 @@ def test_live_view_has_bounded_memory_and_keeps_newest_frame(sizes, most, max_by
     live = LiveGraph("test", max_bytes, most)
     for stamp, size in enumerate(sizes):
         live.add_cloud(cloud(stamp, size))
-        kept = [f.cloud for f in live._frames.values()]
-        assert live._bytes == sum(len(c.data) for c in kept)
-        assert len(kept) == 1 or (len(kept) <= most and live._bytes <= max_bytes)
-        assert live.end == stamp + 1 == live.first + len(kept)
+        clouds = [f.cloud for f in live._frames.values()]
+        assert live._bytes == sum(len(c.data) for c in clouds)
+        assert len(clouds) == 1 or (len(clouds) <= most and live._bytes <= max_bytes)
+        assert live.end == stamp + 1 == live.first + len(clouds)
         assert len(live.load_scan(stamp).xyz) == size
-        assert len(live._by_stamp) == len(kept)
+        assert len(live._by_stamp) == len(clouds)
     if live.first:
         with pytest.raises(InputError, match="no longer stored"):
             live.load_scan(live.first - 1)

@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from lidar_perception.types import Detections
 from lidar_studio.actions import apply
 from lidar_studio.interpolation import Motion
-from lidar_studio.proposals import ProposalRequest, find_objects
+from lidar_studio.proposals import ProposalRequest, compute_size_similarity, find_objects
 from lidar_studio.proposer import merge_proposals
 from lidar_studio.state import KEY, PROPOSED, Box, State, Track
 from lidar_studio.survey import FrameSurvey
@@ -82,3 +84,15 @@ def test_two_clicks_in_one_frame_create_two_tracks():
     placed_boxes = [(np.array([x, 0.0, -1, 0.8, 0.6, 1.7, 0]), "Pedestrian") for x in (5.0, 9.0)]
     objects, _ = find_objects(survey, ProposalRequest(), placed_boxes)
     assert objects.boxes[:, 0].tolist() == [5.0, 9.0]
+
+
+@given(st.floats(0.5, 12), st.floats(0.3, 3), st.floats(0.5, 4), st.floats(0.2, 1.2))
+def test_clusters_of_equal_size_are_most_similar(length, width, height, factor):
+    length, width = max(length, width), min(length, width)
+    size = length, width, height
+    shape = np.array([[9.0, 0, 0, *size, 0.3]])
+    assert compute_size_similarity(shape, size) == pytest.approx(1.0)
+    scaled_shape = shape * [1, 1, 1, factor, 1, 1, 1]
+    assert 0 <= compute_size_similarity(scaled_shape, size)[0] <= 1
+    similarities = [compute_size_similarity(shape * [1, 1, 1, s, s, s, 1], size)[0] for s in (1.0, 1.1, 1.3, 1.6)]
+    assert similarities == sorted(similarities, reverse=True) and similarities[-1] < 0.1

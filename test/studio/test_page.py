@@ -82,8 +82,8 @@ def test_dragging_a_face_moves_only_that_face(page, labels, person, selector, na
     drag(page, get_centre(page, f"{selector} circle[data-handle='{name}']"), offset)
     labels.wait(page, number, lambda t: get_boxes(t)[0] != before)
     old, new = get_face_positions(before), get_face_positions(labels.box(number))
-    moved = [face for face in old if not np.allclose(old[face], new[face], atol=1e-6)]
-    assert moved == [name], moved
+    moved_faces = [face for face in old if not np.allclose(old[face], new[face], atol=1e-6)]
+    assert moved_faces == [name], moved_faces
     assert new[name] > old[name]
 
 
@@ -109,15 +109,15 @@ def test_body_moves_horizontally_and_rotates_about_its_centre(page, labels, pers
     before = labels.box(number)
     drag(page, get_centre(page, "[data-view=top] rect.body"), (30, 10))
     labels.wait(page, number, lambda t: get_boxes(t)[0] != before)
-    moved = labels.box(number)
-    assert moved[2:] == pytest.approx(before[2:]) and math.dist(moved[:2], before[:2]) > 0.1
+    moved_box = labels.box(number)
+    assert moved_box[2:] == pytest.approx(before[2:]) and math.dist(moved_box[:2], before[:2]) > 0.1
     x, y = get_centre(page, "[data-view=top] circle.turn")
     centre = get_centre(page, "[data-view=top]")
     drag(page, (x, y), (centre[0] - x, centre[1] - 60 - y))  # from the right to the top: a quarter turn
-    labels.wait(page, number, lambda t: get_boxes(t)[0] != moved)
+    labels.wait(page, number, lambda t: get_boxes(t)[0] != moved_box)
     turned = labels.box(number)
-    assert turned[:6] == pytest.approx(moved[:6], abs=1e-6)
-    assert wrap_angle(turned[6] - moved[6]) == pytest.approx(math.pi / 2, abs=0.1)
+    assert turned[:6] == pytest.approx(moved_box[:6], abs=1e-6)
+    assert wrap_angle(turned[6] - moved_box[6]) == pytest.approx(math.pi / 2, abs=0.1)
 
 
 def test_arrow_keys_move_along_the_box_as_one_action(page, labels, person):
@@ -312,8 +312,8 @@ def test_killed_server_loses_no_saved_labels(page, browser, labels, person):
     with run_server(*labels.arguments) as server:
         labels.process, labels.url = server.process, server.url
         assert labels.tracks() == before and before[number]["state"] != "rejected"
-        with open_page(browser, server.url) as again:
-            assert again.evaluate("n => page.store.tracks.has(n)", number)
+        with open_page(browser, server.url) as second_page:
+            assert second_page.evaluate("n => page.store.tracks.has(n)", number)
         page.wait_for_function(
             "() => document.getElementById('lost').textContent.includes('address')"
         )  # it has a new token now

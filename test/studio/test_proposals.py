@@ -9,8 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from lidar_perception.classes import CAR, PEDESTRIAN
 from lidar_perception.data.frame import BOXES, POSES, Recording
@@ -22,7 +20,6 @@ from lidar_studio import survey_cache
 from lidar_studio.actions import apply
 from lidar_studio.drive import Drive
 from lidar_studio.journal import JOURNAL_NAME
-from lidar_studio.proposals import compute_size_similarity
 from lidar_studio.session import open_session
 from lidar_studio.snap import snap_to_cluster, snap_to_ground
 from lidar_studio.state import KEY, PROPOSED, Box, State, track_to_json
@@ -147,18 +144,6 @@ def check_proposals_of_clicked_car(session):
     assert scores == sorted(scores, reverse=True)
     with pytest.raises(InputError, match="no pedestrian seed"):
         session.proposer.compare_with_seed(session.state, clicked_track, 0)
-
-
-@given(st.floats(0.5, 12), st.floats(0.3, 3), st.floats(0.5, 4), st.floats(0.2, 1.2))
-def test_clusters_of_equal_size_are_most_similar(length, width, height, factor):
-    length, width = max(length, width), min(length, width)
-    size = length, width, height
-    shape = np.array([[9.0, 0, 0, *size, 0.3]])
-    assert compute_size_similarity(shape, size) == pytest.approx(1.0)
-    scaled_shape = shape * [1, 1, 1, factor, 1, 1, 1]
-    assert 0 <= compute_size_similarity(scaled_shape, size)[0] <= 1
-    similarities = [compute_size_similarity(shape * [1, 1, 1, s, s, s, 1], size)[0] for s in (1.0, 1.1, 1.3, 1.6)]
-    assert similarities == sorted(similarities, reverse=True) and similarities[-1] < 0.1
 
 
 def run_survey(drive, folder, last_count=FRAMES):

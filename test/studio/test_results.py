@@ -120,14 +120,14 @@ NUMBERS = st.lists(st.integers(-(2**31), 2**31 - 1), min_size=1, max_size=6, uni
 @given(st.lists(NUMBERS, min_size=2, max_size=4), st.integers(1, 10**6))
 def test_tracks_of_different_trackers_have_distinct_ids(trackers, far):
     trackers[1] = [*{*trackers[1], *(n + far for n in trackers[0] if n + far < 2**31)}]
-    made = [
+    sources = [
         [t["id"] for t in tracks_to_json({0: make_marked_objects(numbers)}, "/a/output/tracks", k)]
         for k, numbers in enumerate(trackers)
     ]
-    all_ids = [number for each in made for number in each]
+    all_ids = [number for each in sources for number in each]
     assert len(set(all_ids)) == len(all_ids) == sum(map(len, trackers))
     assert all(0 <= number < 2**53 for number in all_ids)  # integers that JavaScript represents exactly
-    assert set(made[0]) >= {n for n in trackers[0] if n >= 0}
+    assert set(sources[0]) >= {n for n in trackers[0] if n >= 0}
 
 
 def test_track_has_the_last_class_of_its_tracker():
@@ -149,10 +149,10 @@ def make_marked_objects(numbers):
 
 def test_tracks_of_all_trackers_in_a_bag_are_distinct(tmp_path):
     numbers = {"/a/tracker/output/tracks": [1, 7], "/b/tracker/output/tracks": [1, 5]}
-    with BagWriter(tmp_path / "bag") as made:
+    with BagWriter(tmp_path / "bag") as writer:
         for topic, ids in numbers.items():
-            made.add_topic(topic, "visualization_msgs/msg/MarkerArray")
-            made.write(
+            writer.add_topic(topic, "visualization_msgs/msg/MarkerArray")
+            writer.write(
                 topic,
                 10,
                 to_marker_array(

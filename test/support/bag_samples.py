@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import io
+import shutil
 from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
+import yaml
 from rosbags.convert.converter import convert
 from rosbags.typesys import Stores, get_typestore
 from samples import CALIBRATION, STAMP, make_scene, make_walker_truth
@@ -53,3 +55,12 @@ def as_ros1(source: Path, path: Path, compress: str | None = None) -> Path:
     with redirect_stdout(io.StringIO()):
         convert([source], path, "", 0, compress, "", None, get_typestore(Stores.ROS1_NOETIC), (), (), (), ())
     return path
+
+
+def copy_with_metadata(bag: Path, folder: Path, change) -> Path:
+    """Return a copy of the bag with changed metadata.yaml."""
+    shutil.copytree(bag, folder)
+    metadata = yaml.safe_load((folder / "metadata.yaml").read_text())
+    change(metadata["rosbag2_bagfile_information"])
+    (folder / "metadata.yaml").write_text(yaml.safe_dump(metadata))
+    return folder

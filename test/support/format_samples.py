@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 from samples import INTRINSICS, LIDAR_TO_CAMERA
@@ -10,12 +11,16 @@ from samples import INTRINSICS, LIDAR_TO_CAMERA
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame
 from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
+from lidar_perception.labels.exchange import export_labels
 from lidar_perception.types import PointCloud
 
 CALIBRATION = Calibration(INTRINSICS, LIDAR_TO_CAMERA, 1242, 375)
 DRIVES = {"one": ("0000",), "several": ("0003", "0011")}
 NOTES = ("openlabel", "mcap", "mcap-labels")
 KITTI = ("kitti", "kitti-tracking")
+# A car, and the direction of its heading.
+BOX = np.array([10.0, 5.0, -1.0, 4.0, 1.8, 1.5, 2.0])
+HEADING = np.array([math.cos(2.0), math.sin(2.0), 0.0])
 # Rounding error of each format, metres and radians.
 EXACT = {
     "kitti": 2e-6,
@@ -45,12 +50,12 @@ def make_sloped_pose(i: int) -> np.ndarray:
 def make_format_drive(name: str, frames: int = 3, camera: bool = True) -> list[Frame]:
     """Return frames of each sequence of a drive; numbers start at 5."""
     rng = np.random.default_rng(0)
-    made = []
+    drive_frames = []
     for s, sequence in enumerate(DRIVES[name]):
         for i in range(5, 5 + frames):
             stamp = 1_700_000_000_000_000_000 + (100 * s + i) * 100_000_000
             xyz = rng.uniform(-20, 20, (50, 3)).astype(np.float32)
-            made.append(
+            drive_frames.append(
                 Frame.of(
                     f"{sequence}/{i:06}",
                     PointCloud.of(xyz, None, stamp, "velodyne"),
@@ -60,7 +65,7 @@ def make_format_drive(name: str, frames: int = 3, camera: bool = True) -> list[F
                     index=i,
                 )
             )
-    return made
+    return drive_frames
 
 
 def make_labels(frames: list[Frame], format: str, seed: int = 0) -> DriveLabels:
@@ -105,3 +110,20 @@ def assert_equal_labels(labels: DriveLabels, others: DriveLabels, tolerance: flo
         assert [a.class_names[i] for i in one] == [b.class_names[i] for i in other]
         np.testing.assert_array_equal(a.track_ids[one], b.track_ids[other])
         np.testing.assert_allclose(a.scores[one], b.scores[other], rtol=0, atol=5e-7)
+
+
+def make_one_frame() -> list[Frame]:
+    return make_format_drive("one", frames=1)
+
+
+def export_box(format: str, path: Path, box: np.ndarray = BOX, **more) -> Path:
+    """Write the labels of one frame with one car."""
+    (frame,) = frames = make_one_frame()
+    labels = FrameLabels.of(frame.name, frame.stamp_ns, [box], ["Car"], [7], [0.5], **more)
+    export_labels(DriveLabels([labels]), format, path, frames)
+    return path
+
+
+def assert_same_points(found: np.ndarray, expected: np.ndarray) -> None:
+    """Assert that two sets of points are the same, in any order."""
+    np.testing.assert_allclose(np.sort(np.round(found, 5), axis=0), np.sort(np.round(expected, 5), axis=0), atol=1e-5)

@@ -160,14 +160,14 @@ def second_pass(prepared, kind, level, least, metric, threshold):
     """Return precision and orientation similarity of detections with at least this score."""
     right = wrong = similarity = 0
     for truth, found, table in prepared:
-        kept = [j for j, d in enumerate(found) if d["score"] >= threshold]
+        accepted = [j for j, d in enumerate(found) if d["score"] >= threshold]
         used = set()
         for i, o in enumerate(truth):
             role = role_of_truth(o, kind, level)
             if role is None:
                 continue
             fitting = {"judge": [], "may be used": [], None: []}
-            for j in kept:
+            for j in accepted:
                 if j not in used and table[j, i] > least:
                     fitting[role_of_detection(found[j], kind, level)].append(j)
             if fitting["judge"]:
@@ -180,7 +180,7 @@ def second_pass(prepared, kind, level, least, metric, threshold):
             if role == "find" and role_of_detection(found[j], kind, level) == "judge":
                 right += 1
                 similarity += (1 + math.cos(o["alpha"] - found[j]["alpha"])) / 2
-        for j in kept:
+        for j in accepted:
             if role_of_detection(found[j], kind, level) != "judge" or j in used:
                 continue
             if metric == "image" and any(

@@ -141,12 +141,12 @@ class Node(SimpleNamespace):
         ]
         words = [self.executable, *self.arguments, "--ros-args", *self.ros_arguments]
         words += [word for a, b in rules for word in ("-r", f"{a}:={b}")]
-        for number, given in enumerate(self.parameters):
-            if isinstance(given, Mapping):
+        for number, parameters in enumerate(self.parameters):
+            if isinstance(parameters, Mapping):
                 file = folder / f"{self.namespace}-{self.name}-{number}.yaml"
-                file.write_text(yaml.safe_dump({"/**": {"ros__parameters": dict(given)}}))
-                given = str(file)
-            words += ["--params-file", given]
+                file.write_text(yaml.safe_dump({"/**": {"ros__parameters": dict(parameters)}}))
+                parameters = str(file)
+            words += ["--params-file", parameters]
         return words
 
 

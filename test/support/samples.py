@@ -140,9 +140,9 @@ def make_upright(rng, x: float, y: float, height: float, width: float) -> np.nda
         m.ravel() for m in np.meshgrid(np.arange(0.02, height, 0.0073 * away), np.arange(-0.5, 0.5, 0.003 * away))
     )
     wide = np.interp(z / height, [0, 0.5, 0.8, 0.85, 1], [0.2, 0.3, 0.5, 0.2, 0.15])
-    kept = np.abs(across) < (wide / 2 if width < 0 else width / 2)
+    is_kept = np.abs(across) < (wide / 2 if width < 0 else width / 2)
     side, depth = np.array([-y, x, 0]) / away, np.array([x, y, 0]) / away
-    xyz = np.outer(across[kept], side) + [x, y, -1.7] + np.outer(z[kept], [0, 0, 1])
+    xyz = np.outer(across[is_kept], side) + [x, y, -1.7] + np.outer(z[is_kept], [0, 0, 1])
     return xyz + np.outer(rng.uniform(-0.2, 0.2, len(xyz)), depth)
 
 

@@ -60,15 +60,15 @@ def test_page_contains_the_example_files():
 def test_example_test_passes_and_failure_shows_the_detections(folder):
     (folder / "test_broken.py").write_text(BROKEN)
     done = run(folder, "pytest", "-q", "-p", "no:cacheprovider", "test_emergency_stop.py", "test_broken.py")
-    said = " ".join(done.stdout.split())
-    assert "2 failed, 3 passed" in said, done.stdout
+    output = " ".join(done.stdout.split())
+    assert "2 failed, 3 passed" in output, done.stdout
     for words in (
         "while the test waited for a miracle, speaker ended with code 3",
         "log of speaker, which ended with code 3",
         "I am tired",
         "waiting for 2 messages on /nowhere; diagnostics: none; received: /nowhere no messages from 0 publishers",
     ):
-        assert words in said, done.stdout
+        assert words in output, done.stdout
 
 
 @pytest.mark.skipif(

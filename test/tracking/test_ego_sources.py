@@ -93,10 +93,10 @@ def drive():
 
 
 def test_odometry_of_simulated_drive_is_repeatable(drive):
-    first, again = Odometry(), Odometry()
+    first, second = Odometry(), Odometry()
     for xyz, at in drive:
         found = first(xyz)
-        np.testing.assert_array_equal(again(xyz), found)
+        np.testing.assert_array_equal(second(xyz), found)
         step = np.linalg.inv(drive[0][1]) @ at
         assert np.linalg.norm(found[:3, 3] - step[:3, 3]) < 0.25
         assert np.abs(found[:3, :3] - step[:3, :3]).max() < 5e-3

@@ -30,9 +30,9 @@ def draw_covariances(seed=0, count=1):
 def test_two_predictions_equal_one_long_prediction(state, first, second):
     means, p = np.array([state]), draw_covariances()
     at_once = predict(means, p, first + second, NONE, NONE, NONE)
-    again = predict(*predict(means, p, first, NONE, NONE, NONE), second, NONE, NONE, NONE)
-    np.testing.assert_allclose(again[0][:, [0, 1, 2, 3, 5]], at_once[0][:, [0, 1, 2, 3, 5]], atol=1e-6)
-    assert wrap_angle(again[0][0, 4] - at_once[0][0, 4]) == pytest.approx(0, abs=1e-6)
+    twice_predicted = predict(*predict(means, p, first, NONE, NONE, NONE), second, NONE, NONE, NONE)
+    np.testing.assert_allclose(twice_predicted[0][:, [0, 1, 2, 3, 5]], at_once[0][:, [0, 1, 2, 3, 5]], atol=1e-6)
+    assert wrap_angle(twice_predicted[0][0, 4] - at_once[0][0, 4]) == pytest.approx(0, abs=1e-6)
 
 
 @given(STATE, st.floats(0.01, 0.5))
@@ -78,15 +78,15 @@ def test_opposite_headings_give_equal_updates(heading, off):
 
 def test_lateral_speed_decays_and_reversed_heading_is_flipped():
     means = np.array([[0.0, 0, 5, 1, 0, 0]])
-    kept, p = constrain_to_heading(means, np.eye(6)[None], np.array([0.1]))
-    across = [np.cos(m[4]) * m[3] - np.sin(m[4]) * m[2] for m in (means[0], kept[0])]
+    constrained_means, p = constrain_to_heading(means, np.eye(6)[None], np.array([0.1]))
+    across = [np.cos(m[4]) * m[3] - np.sin(m[4]) * m[2] for m in (means[0], constrained_means[0])]
     assert abs(across[1]) < 0.2 * abs(across[0]) and (np.linalg.eigvalsh(p) > 0).all()
     backwards = np.array([[0.0, 0, -5, 0, 0.2, 0], [0, 0, -0.5, 0, 0.2, 0]])
     flipped, agreement = flip_reversed_headings(backwards, np.array([9.0, 9.0]), np.array([2.0, 2.0]))
     assert flipped[:, 4] == pytest.approx([0.2 - np.pi, 0.2])
     assert agreement.tolist() == [-9, 9]
-    again, _ = flip_reversed_headings(flipped, agreement, np.full(2, 2.0))
-    assert again.tolist() == flipped.tolist()  # the measured headings do not flip it back
+    flipped_back, _ = flip_reversed_headings(flipped, agreement, np.full(2, 2.0))
+    assert flipped_back.tolist() == flipped.tolist()  # the measured headings do not flip it back
 
 
 def test_covariances_rotate_with_the_axes():

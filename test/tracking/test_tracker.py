@@ -79,8 +79,8 @@ def test_fast_car_is_one_track_at_any_rate(rate):
 def test_tracker_is_deterministic_and_keeps_its_input():
     frames = list(make_crowd_detections(3))
     before = [f.boxes.copy() for f in frames]
-    first, again = track(frames), track(frames)
-    for a, b in zip(first, again):
+    first, second = track(frames), track(frames)
+    for a, b in zip(first, second):
         for name in ("ids", "velocities", "covariances", "moving"):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
         np.testing.assert_array_equal(a.detections.boxes, b.detections.boxes)
@@ -92,11 +92,11 @@ def test_tracker_is_deterministic_and_keeps_its_input():
 def test_moving_sensor_gives_same_tracks_as_static_one(roll):
     frames = list(make_crowd_detections(1))
     poses = [make_flat_pose(0.9 * i, 0.1 * i, 0.04 * i) @ make_tilted_pose(roll, 0.0) for i in range(len(frames))]
-    moved = [
+    transformed_boxes = [
         Detections.of(transform_boxes(f.boxes, np.linalg.inv(p)), f.class_ids, f.scores) for f, p in zip(frames, poses)
     ]
     standing = track(frames, [np.eye(4)] * len(frames))
-    for still, seen, p in zip(standing, track(moved, poses), poses):
+    for still, seen, p in zip(standing, track(transformed_boxes, poses), poses):
         assert seen.ids.tolist() == still.ids.tolist()
         back = transform_boxes(seen.detections.boxes, p)
         np.testing.assert_allclose(back[:, :6], still.detections.boxes[:, :6], atol=1e-3)

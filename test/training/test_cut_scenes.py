@@ -224,11 +224,11 @@ def test_scene_is_cut_by_clustering_and_around_objects(rng, tmp_path):
     assert np.array_equal(cut.boxes[cut.is_box_crop], BOXES[:2])
     assert not cut.boxes[cut.labels == UNKNOWN].any() and cut.boxes[cut.labels == 1].any()
     source = CutScenes(RepeatedScene(scene), CONFIG, 5, tmp_path)
-    first, again = source.load_scene(0), source.load_scene(0)  # the second one is read from the cache
+    first, second = source.load_scene(0), source.load_scene(0)  # the second one is read from the cache
     assert len(list(tmp_path.iterdir())) == 1
     for name in ("labels", "boxes", "is_box_crop"):
-        assert np.array_equal(getattr(first, name), getattr(again, name))
-    assert np.array_equal(first.clusters.points, again.clusters.points)
+        assert np.array_equal(getattr(first, name), getattr(second, name))
+    assert np.array_equal(first.clusters.points, second.clusters.points)
     next(tmp_path.iterdir()).write_bytes(b"broken")
     assert np.array_equal(source.load_scene(0).labels, first.labels)
     other = CutScenes(RepeatedScene(scene), make_pointnet_config("base"), 5, tmp_path)
@@ -270,8 +270,8 @@ def test_fraction_of_sparse_scenes_is_reproducible(rng, tmp_path):
     whole, known = none.load_scene(0), set(map(bytes, scene.points[:, :3]))
     sizes = []
     for i in range(count):
-        thinned, again = all_.load_scene(i), all_.load_scene(i)  # the second one is read from the cache
-        assert np.array_equal(thinned.clusters.points, again.clusters.points)
+        thinned, second = all_.load_scene(i), all_.load_scene(i)  # the second one is read from the cache
+        assert np.array_equal(thinned.clusters.points, second.clusters.points)
         assert known >= set(map(bytes, thinned.clusters.points[:, :3]))
         sizes.append(thinned.clusters.sizes[(thinned.labels == 0) & thinned.is_box_crop][0])
     car = whole.clusters.sizes[(whole.labels == 0) & whole.is_box_crop][0]

@@ -82,8 +82,8 @@ def test_fitted_scores_are_probabilities_in_any_order_of_scans(seed):
     assert fits["Pedestrian"].new_score.loss < fits["Pedestrian"].old_score.loss
     assert fits["Pedestrian"].proposals == 4000
     assert fits["Pedestrian"].correct == own.correct.sum()
-    again, _ = fit_classes(own.take(rng.permutation(4000)), load_shipped_models())
-    for curve, before in zip(again["Pedestrian"]["curves"].values(), models["Pedestrian"]["curves"].values()):
+    permuted_models, _ = fit_classes(own.take(rng.permutation(4000)), load_shipped_models())
+    for curve, before in zip(permuted_models["Pedestrian"]["curves"].values(), models["Pedestrian"]["curves"].values()):
         np.testing.assert_allclose(curve["values"], before["values"], atol=0.02)
     # A class with too few samples keeps its curves.
     assert models["Car"] == load_shipped_models()["Car"] and fits["Car"].new_score is None
@@ -159,19 +159,19 @@ def test_fusion_file_can_be_read_after_its_folder_is_moved(others, tmp_path, mon
     assert fusion.models_without_intensity["Car"]["bias"] == pytest.approx(models["Car"]["bias"] - 2)
     assert fusion.curve_warning is None
     assert fusion.proposer == find_proposer_weights()
-    moved = tmp_path.parent / f"{tmp_path.name}-moved"
-    tmp_path.rename(moved)
-    again = read_fusion(moved / "fused.json")
-    assert again.classifier == moved / "own/pointnet.safetensors" and again.curve_warning is None
-    monkeypatch.chdir(moved)
+    new_folder = tmp_path.parent / f"{tmp_path.name}-moved"
+    tmp_path.rename(new_folder)
+    read_models = read_fusion(new_folder / "fused.json")
+    assert read_models.classifier == new_folder / "own/pointnet.safetensors" and read_models.curve_warning is None
+    monkeypatch.chdir(new_folder)
     assert open_detector("fused.json", "cpu").models == models
     assert find_fused_weights(FusedParams(weights="fused.json")).name == "fused.json"
     # Changed or missing weights.
-    again.classifier.write_bytes(again.classifier.read_bytes() + b"\0")
-    assert "pointnet.safetensors, so its scores" in read_fusion(moved / "fused.json").curve_warning
-    again.classifier.unlink()
+    read_models.classifier.write_bytes(read_models.classifier.read_bytes() + b"\0")
+    assert "pointnet.safetensors, so its scores" in read_fusion(new_folder / "fused.json").curve_warning
+    read_models.classifier.unlink()
     with pytest.raises(InputError, match=r"refers to .*pointnet.safetensors, which does not exist"):
-        read_fusion(moved / "fused.json")
+        read_fusion(new_folder / "fused.json")
 
 
 @pytest.mark.parametrize("curves", [[], 0, "", {}, {"Car": {}}])

@@ -163,9 +163,13 @@ def test_samples_do_not_depend_on_sensor_height(tmp_path):
     config, samples = make_tiny_config(), []
     for height in SENSOR_HEIGHT, 0.6:
         source = open_labelled_frames(low_bag(tmp_path / f"{height}", height)).to_scenes()
-        again = pickle.loads(pickle.dumps(source))
-        assert again.sensor_height == again.load_scene(0).height == again.load_frame(1).sensor_height
-        assert again.sensor_height == pytest.approx(height, abs=0.011)
+        copied_source = pickle.loads(pickle.dumps(source))
+        assert (
+            copied_source.sensor_height
+            == copied_source.load_scene(0).height
+            == copied_source.load_frame(1).sensor_height
+        )
+        assert copied_source.sensor_height == pytest.approx(height, abs=0.011)
         samples.append(ScenePreparation(config, STILL)(source.load_scene(0), np.random.default_rng(0)))
     assert len(samples[0].points) == len(samples[1].points)
     assert np.allclose(samples[0].boxes, samples[1].boxes, atol=0.011)

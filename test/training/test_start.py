@@ -205,8 +205,8 @@ def test_resumed_run_keeps_plan_and_rejects_other_settings(tmp_path, one_thread)
     assert (plan["scans"], plan["steps"]) == (2, 2)
     other = CliRunner().invoke(cli, [*arguments, "--resume"])
     assert "0.9" in str(other.exception) and "0.6" in str(other.exception)
-    again = [*arguments, "--mount-height", "0.6", "--resume", "--budget", "7"]
-    assert CliRunner().invoke(cli, again).exit_code == 0
+    resume_arguments = [*arguments, "--mount-height", "0.6", "--resume", "--budget", "7"]
+    assert CliRunner().invoke(cli, resume_arguments).exit_code == 0
 
 
 def small_run(kind: str, out: Path, root: Path, *more: str):

@@ -30,7 +30,7 @@ def cache(tmp_path_factory):
 
 
 def train(cache, out, *more, **changes):
-    given = {
+    options = {
         "--data": "sim",
         "--sensor": SENSOR,
         "--data-scans": 2,
@@ -45,7 +45,7 @@ def train(cache, out, *more, **changes):
         "--out": out,
         **changes,
     }
-    words = [str(word) for pair in given.items() for word in pair]
+    words = [str(word) for pair in options.items() for word in pair]
     return CliRunner().invoke(cli, ["train", "pointnet", *words, *more])
 
 
@@ -62,8 +62,8 @@ def test_trained_network_opens_as_detector(cache, tmp_path):
     assert network.offsets.abs().sum() > 0  # calibrated
     open_detector(out / "last.safetensors", "cpu")(simulate_scan(3, 0, find_sensor(SENSOR)).frame)
     # the same seed gives the same weights, also from the cache
-    again = train(cache, tmp_path / "again")
-    assert again.exit_code == 0
+    second_run = train(cache, tmp_path / "again")
+    assert second_run.exit_code == 0
     assert _weights(tmp_path / "again") == _weights(out)
     twice = train(cache, out)
     assert isinstance(twice.exception, InputError) and "--resume" in str(twice.exception)

@@ -170,10 +170,10 @@ def test_intensity_of_a_scan_is_removed_or_distorted():
 @given(seeds, st.booleans())
 def test_augmentation_is_deterministic_and_zero_is_identity(seed, around):
     scene = make_random_scene(seed, around)
-    kept = scene.points.copy(), scene.boxes.copy()
+    original = scene.points.copy(), scene.boxes.copy()
     once, twice = (augment_scene(scene, AugmentParams(), np.random.default_rng(seed)) for _ in "ab")
     assert np.array_equal(once.points, twice.points) and np.array_equal(once.boxes, twice.boxes)
-    assert np.array_equal(scene.points, kept[0]) and np.array_equal(scene.boxes, kept[1])
+    assert np.array_equal(scene.points, original[0]) and np.array_equal(scene.boxes, original[1])
     same = augment_scene(scene, STILL, np.random.default_rng(seed))
     np.testing.assert_allclose(same.points, scene.points, atol=1e-5)
     np.testing.assert_allclose(same.boxes, scene.boxes, atol=1e-9)
@@ -206,8 +206,8 @@ def test_pasted_objects_touch_nothing_and_keep_points(seed):
         origin = np.abs(ranges - np.hypot(box[0], box[1])).argmin()
         assert ranges[origin] == pytest.approx(np.hypot(box[0], box[1]), abs=1e-9)
         assert number <= sizes[origin] and sizes[origin] >= 5  # others may hide it
-    again = paste_objects(scene, database, params, *AREA, np.random.default_rng(seed))
-    assert np.array_equal(again.points, fuller.points)
+    second_result = paste_objects(scene, database, params, *AREA, np.random.default_rng(seed))
+    assert np.array_equal(second_result.points, fuller.points)
 
 
 def make_wall(x: float, y: tuple[float, float], z: tuple[float, float], apart: float = 0.02) -> np.ndarray:
@@ -282,9 +282,9 @@ def test_range_noise_is_along_rays_and_shared_by_beams(seed):
     assert np.array_equal(blur_ranges(points, 0, 0, rng), points)
     before = np.linalg.norm(points[:-1, :3], axis=1)
     for beam, point in ((0.05, 0.0), (0.0, 0.05)):
-        moved = blur_ranges(points, beam, point, rng)[:-1]
-        after = np.linalg.norm(moved[:, :3], axis=1)
-        np.testing.assert_allclose(moved[:, :3] / after[:, None], points[:-1, :3] / before[:, None], atol=1e-5)
+        noisy_points = blur_ranges(points, beam, point, rng)[:-1]
+        after = np.linalg.norm(noisy_points[:, :3], axis=1)
+        np.testing.assert_allclose(noisy_points[:, :3] / after[:, None], points[:-1, :3] / before[:, None], atol=1e-5)
         shift, (x, y, z) = after - before, points[:-1, :3].T
         assert 0.02 < shift.std() < 0.1
         beams = np.floor(np.arctan2(z, np.hypot(x, y)) / BEAM_STEP)

@@ -41,7 +41,7 @@ def cache(tmp_path_factory):
 
 
 def train_on_simulation(cache, out, **changes):
-    given = {
+    options = {
         "--data": "sim",
         "--sensor": SENSOR,
         "--data-scans": 1,
@@ -56,7 +56,7 @@ def train_on_simulation(cache, out, **changes):
         "--out": out,
         **changes,
     }
-    return [word for pair in given.items() for word in pair]
+    return [word for pair in options.items() for word in pair]
 
 
 def test_trained_network_opens_as_detector(tmp_path, cache, tiny_size):
@@ -77,8 +77,8 @@ def test_trained_network_opens_as_detector(tmp_path, cache, tiny_size):
     detector(simulate_scan(3, 0, find_sensor(SENSOR)).frame)
     # a finished run does not change
     before = (out / "last.safetensors").read_bytes()
-    again = train(*train_on_simulation(cache, out), "--version", "v4", "--seed", 5)
-    assert again.exit_code == 1 and "--resume" in str(again.exception)
+    second_run = train(*train_on_simulation(cache, out), "--version", "v4", "--seed", 5)
+    assert second_run.exit_code == 1 and "--resume" in str(second_run.exception)
     assert train(*train_on_simulation(cache, out), "--version", "v4", "--seed", 5, "--resume").exit_code == 0
     assert (out / "last.safetensors").read_bytes() == before
     # another run starts from its weights

@@ -53,6 +53,8 @@ def test_training_in_16_bits_lowers_loss():
     losses = [run.step(batch)["loss"] for _ in range(run.steps)]
     assert losses[-1] < 0.3 * losses[0] and run.progress.skipped == 0
     state = run.make_state()
-    again, _ = run_on("cuda", "v4", "auto")
-    again.load(state)
-    assert all(torch.equal(a, b) for a, b in zip(run.module.state_dict().values(), again.module.state_dict().values()))
+    second_loss, _ = run_on("cuda", "v4", "auto")
+    second_loss.load(state)
+    assert all(
+        torch.equal(a, b) for a, b in zip(run.module.state_dict().values(), second_loss.module.state_dict().values())
+    )

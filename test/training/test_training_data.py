@@ -57,10 +57,10 @@ def test_cached_scans_equal_simulated_ones(tmp_path, monkeypatch):
     cached = SimulatedScenes(7, 2, SENSOR, cache=tmp_path / "cache")
     frame, truth = plain.load_scan(1)
     for _ in range(2):
-        again = cached.load_scan(1)
-        assert np.array_equal(frame.xyz, again[0].xyz)
-        assert np.array_equal(frame.intensity, again[0].intensity)
-        assert np.array_equal(truth.boxes, again[1].boxes) and truth.extras == again[1].extras
+        second_scan = cached.load_scan(1)
+        assert np.array_equal(frame.xyz, second_scan[0].xyz)
+        assert np.array_equal(frame.intensity, second_scan[0].intensity)
+        assert np.array_equal(truth.boxes, second_scan[1].boxes) and truth.extras == second_scan[1].extras
         monkeypatch.setattr(scenes_module, "simulate_scan", None)  # the second one is read from the cache
     monkeypatch.undo()
     (file,) = (tmp_path / "cache").iterdir()
@@ -289,11 +289,11 @@ def test_samples_do_not_depend_on_sensor_height():
         usual = ScenePreparation(config, STILL)(scene, np.random.default_rng(0))
         for height in 0.6, 2.4:
             other = replace(raise_scene(scene, SENSOR_HEIGHT - height), height=height)
-            made = ScenePreparation(config, STILL)(other, np.random.default_rng(0))
-            assert np.allclose(made.points, usual.points, atol=1e-5)
-            assert np.allclose(made.boxes, usual.boxes, atol=1e-5)
-            assert np.array_equal(made.labels, usual.labels)
-            assert np.array_equal(made.is_target, usual.is_target)
+            sample = ScenePreparation(config, STILL)(other, np.random.default_rng(0))
+            assert np.allclose(sample.points, usual.points, atol=1e-5)
+            assert np.allclose(sample.boxes, usual.boxes, atol=1e-5)
+            assert np.array_equal(sample.labels, usual.labels)
+            assert np.array_equal(sample.is_target, usual.is_target)
 
 
 @pytest.mark.parametrize("quarter", range(4))

@@ -92,11 +92,11 @@ def test_encoded_empty_array_equals_the_serialized_message():
 def test_encoded_detection_array_equals_the_serialized_message(boxes, frame_id, seed):
     """vision_msgs is not in the wheels of ROS, so the reference is rosbags alone."""
     rng, count, boxes = np.random.default_rng(seed), len(boxes), np.reshape(boxes, (-1, 7))
-    given = dict(
+    columns = dict(
         boxes=boxes,
         labels=rng.choice(CLASSES, count).tolist(),
         scores=rng.random(count),
         header=make_any_header(make_bag_message, START, frame_id),
         **({"ids": rng.integers(0, 10**5, count), "covariances": rng.random((count, 6, 6))} if seed % 2 else {}),
     )
-    assert encode_detection_array(**given) == encode(to_detection_array(**given, make=make_bag_message))
+    assert encode_detection_array(**columns) == encode(to_detection_array(**columns, make=make_bag_message))
