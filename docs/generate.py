@@ -191,7 +191,7 @@ def make_config_file(network: str) -> str:
         if key in defaults and value != defaults[key]
     }
     return _make_parameter_file(
-        f"Ground and clusters as in detectors/{network}/params.py, for the nodes ground_segmentation and clustering", values
+        f"Ground and clusters as in detectors/{network}/params.py, for ground_segmentation and clustering", values
     )
 
 
