@@ -282,16 +282,17 @@ def _print_pace(content: dict, rate: float, clouds: int) -> None:
         slowest = max(stages, key=lambda node: stages[node])
         pace_text = f"{speed:.2g}x real time: {slowest} needs {stages[slowest]:.0f} ms per cloud on this machine"
     console.print(f"{clouds} clouds replayed at {pace_text}")
-    console.print(
-        f"{content['results']} results; latency from cloud to tracks: median "
-        f"{latency['median']:.0f} ms, 95th percentile {latency['p95']:.0f} ms; memory of the "
-        f"graph {content['memory_mb']:.0f} MB"
+    latency_text = (
+        f"latency from cloud to tracks: median {latency['median']:.0f} ms, 95th percentile {latency['p95']:.0f} ms"
+        if latency["median"]
+        else "latency not measured, because too few results arrived while the bag was played"
     )
+    console.print(f"{content['results']} results; {latency_text}; memory of the graph {content['memory_mb']:.0f} MB")
+    cpu_ms = sum(content["cpu_ms_by_process"].values())
     console.print(
         "time per cloud: "
         + ", ".join(f"{node} {ms:.0f} ms" for node, ms in stages.items())
-        + f"; CPU time of all processes {sum(content['cpu_ms_by_process'].values()):.0f}"
-        " ms"
+        + (f"; CPU time of all processes {cpu_ms:.0f} ms" if content["results"] > 1 else "")
     )
 
 

@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from detector_node import assert_equal
 
 from lidar_perception.candidates.configurations import PAPER
-from lidar_perception.cli.demo import RECORD, demo
+from lidar_perception.cli.demo import RECORD, _print_pace, demo
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.open import open_detector
@@ -99,6 +99,13 @@ def test_parameters_reach_the_nodes(drive_bag, tmp_path, monkeypatch, arguments,
     monkeypatch.setattr(graph_replay.Processes, "start", start)
     assert run_main(monkeypatch, "demo", drive_bag, *arguments, "--out", tmp_path / "out") == 2
     assert expected.items() <= values_by_node[node].items()
+
+
+def test_demo_shows_no_latency_without_measurements(capsys):
+    content = {"results": 1, "slower": 1.0, "memory_mb": 600.0, "stage_ms": {"tracker": 5.0}}
+    _print_pace(content | {"latency_ms": {"median": 0.0, "p95": 0.0}, "cpu_ms_by_process": {"graph": -0.1}}, 1.0, 40)
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "1 results; latency not measured" in shown and " 0 ms" not in shown and "CPU" not in shown
 
 
 def test_demo_keeps_files_that_it_did_not_create(drive_bag, make_bag, tmp_path):

@@ -173,6 +173,7 @@ def replay(
 
         for node in {"evaluator", TRACKER} & nodes.keys():
             monitor.spin_until(partial(has_caught_up, node), SILENCE_TIMEOUT_S)
+        memory = memory or node_processes.measure_memory_mb()  # most clouds may have been dropped
         stage_ms = {node: float(ms) for node in graph if (ms := monitor.get_value(node, "processing_ms_median"))}
         codes = node_processes.stop(timeout=30)
     if failures := [f"{node} (exit code {code})" for node, code in codes.items() if code]:
