@@ -186,14 +186,10 @@ def as_point_cloud(
         points = points.reshape(0, 3)
     if points.ndim != 2 or points.shape[1] not in (3, 4):
         shape, remedy = points.shape, ""
-        if points.ndim == 2:
-            remedy = (
-                "; pass points[:, :4]"
-                if shape[1] > 4 and shape[0] not in (3, 4)
-                else "; pass points.T"
-                if shape[0] in (3, 4)
-                else ""
-            )
+        if points.ndim == 2 and shape[0] in (3, 4):
+            remedy = "; pass points.T"
+        elif points.ndim == 2 and shape[1] > 4:
+            remedy = "; pass points[:, :4]"
         raise InputError(f"a cloud has shape {shape}, expected (N, 3) [x y z] or (N, 4) [x y z intensity]{remedy}")
     if points.shape[1] == 4 and intensity is not None:
         raise InputError(
@@ -201,11 +197,9 @@ def as_point_cloud(
         )
     if intensity_max is not None and not 0 < intensity_max < np.inf:
         raise InputError(f"intensity_max is {intensity_max:g}, but must be above 0: 1, 100 or 255 for most drivers")
-    values = (
-        points[:, 3]
-        if points.shape[1] == 4
-        else (None if intensity is None else _to_numbers(intensity, "intensity", "(N,) numbers"))
-    )
+    values = None if intensity is None else _to_numbers(intensity, "intensity", "(N,) numbers")
+    if points.shape[1] == 4:
+        values = points[:, 3]
     if values is not None:
         full_scale = intensity_max or (255.0 if values.dtype == np.uint8 else 1.0)
         values = to_unit(values, full_scale)

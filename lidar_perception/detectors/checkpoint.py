@@ -94,17 +94,7 @@ class Header:
 
     def to_json(self) -> str:
         """Return the header as JSON text."""
-        return json.dumps(
-            dict(
-                format=FORMAT,
-                network=self.network,
-                config=dataclasses.asdict(self.config),
-                training=self.training,
-                metrics=self.metrics,
-                commit=self.commit,
-                calibration=self.calibration,
-            )
-        )
+        return json.dumps({"format": FORMAT, "network": self.network, **dataclasses.asdict(self)})
 
     @staticmethod
     def from_json(text: str | None, source: str, config_class: type[Config] | None = None) -> Header:

@@ -105,13 +105,11 @@ class NormalizedView:
             or (intensity is not None and len(intensity) < MIN_POINTS)
         ):
             return None
-        defect = (
-            "has no intensity"
-            if intensity is None
-            else "has the intensity 0 everywhere"
-            if not intensity.any()
-            else "has the same intensity nearly everywhere"
-        )
+        defect = "has the same intensity nearly everywhere"
+        if intensity is None:
+            defect = "has no intensity"
+        elif not intensity.any():
+            defect = "has the intensity 0 everywhere"
         return (
             f"the cloud {defect}, so fewer people are detected; set use_intensity to false if the sensor has no "
             "intensity"

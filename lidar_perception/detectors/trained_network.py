@@ -112,9 +112,6 @@ class TrainedNetwork:
 
         Used for clouds without detections.
         """
-        best = dict(zip(self.classes, scores))
-        return best, (
-            "the network's scores are NaN; check the weights and the intensity"
-            if any(map(math.isnan, best.values()))
-            else None
-        )
+        best_scores = dict(zip(self.classes, scores))
+        has_nan = any(map(math.isnan, best_scores.values()))
+        return best_scores, "the network's scores are NaN; check the weights and the intensity" if has_nan else None
