@@ -69,37 +69,6 @@ def test_overlaps_equal_shapely(seed):
         np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-@given(seeds, st.floats(-7, 7), st.floats(-80, 80), st.floats(-80, 80))
-def test_overlap_does_not_depend_on_the_frame(seed, yaw, x, y):
-    rng = np.random.default_rng(seed)
-    boxes, others = draw_boxes(rng, 8), draw_boxes(rng, 5)
-    before = bev_and_3d_iou(boxes, others)
-    after = bev_and_3d_iou(move_boxes(boxes, (x, y, 3), yaw), move_boxes(others, (x, y, 3), yaw))
-    np.testing.assert_allclose(after, before, atol=1e-9)
-
-
-@given(seeds)
-def test_overlap_is_symmetric_and_between_0_and_1(seed):
-    rng = np.random.default_rng(seed)
-    boxes, others = draw_boxes(rng, 8), draw_boxes(rng, 5)
-    for there, back in zip(bev_and_3d_iou(boxes, others), bev_and_3d_iou(others, boxes)):
-        np.testing.assert_allclose(there, back.T, atol=1e-9)
-        assert (there >= 0).all() and (there <= 1).all()
-    boxes[:, 5] = others[:, 5] = 1.5
-    bev, space = bev_and_3d_iou(boxes, others)
-    assert (space <= bev + 1e-12).all()
-
-
-@given(seeds)
-def test_equivalent_boxes_have_equal_overlaps(seed):
-    rng = np.random.default_rng(seed)
-    boxes, others = draw_boxes(rng, 8), draw_boxes(rng, 5)
-    before = bev_and_3d_iou(boxes, others)
-    swapped = boxes[:, [0, 1, 2, 4, 3, 5, 6]] + [0, 0, 0, 0, 0, 0, QUARTER]
-    for same in (boxes + [0, 0, 0, 0, 0, 0, np.pi], swapped):
-        np.testing.assert_allclose(bev_and_3d_iou(same, others), before, atol=1e-9)
-
-
 @pytest.mark.parametrize(
     "name, box, other, bev, space",
     [

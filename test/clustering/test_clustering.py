@@ -107,13 +107,6 @@ def test_labels_equal_sklearn_on_degenerate_clouds(name, xyz, min_samples):
         assert_same(np.asarray(xyz, np.float32), eps, min_samples)
 
 
-def test_doubled_points_and_min_samples_keep_the_clusters():
-    rng = np.random.default_rng(5)
-    xyz = rng.uniform(-1, 1, (300, 3)).astype(np.float32)
-    once = dbscan(xyz, 0.3, 5)
-    np.testing.assert_array_equal(dbscan(np.repeat(xyz, 2, axis=0), 0.3, 10), np.repeat(once, 2))
-
-
 @needs_data
 @pytest.mark.parametrize("scan", [0, 11, 23])
 def test_labels_equal_sklearn_on_real_clouds(scan):
@@ -229,20 +222,6 @@ def test_clusters_100_km_away_are_found_like_near_ones():
     assert to_partition(dbscan(distant_xyz, 0.25, 5)) == to_partition(dbscan(xyz, 0.25, 5))
 
 
-@given(st.integers(0, 2**32 - 1))
-def test_permuting_points_permutes_core_clusters_and_noise(seed):
-    rng = np.random.default_rng(seed)
-    xyz = rng.uniform(-1, 1, (250, 3)).astype(np.float32)
-    order = rng.permutation(len(xyz))
-    eps, min_samples = 0.35, 6
-    core = find_core_points(xyz, eps, min_samples)
-    labels = dbscan(xyz, eps, min_samples)
-    back = np.empty_like(labels)
-    back[order] = dbscan(xyz[order], eps, min_samples)
-    assert to_partition(np.where(core, labels, 0)) == to_partition(np.where(core, back, 0))
-    np.testing.assert_array_equal(labels == 0, back == 0)
-
-
 @given(st.integers(0, 2**32 - 1), st.integers(1, 300), st.integers(1, 8))
 def test_ids_are_1_to_K_by_first_core_point(seed, count, min_samples):
     rng = np.random.default_rng(seed)
@@ -254,42 +233,6 @@ def test_ids_are_1_to_K_by_first_core_point(seed, count, min_samples):
     assert firsts == sorted(firsts)
     banded = distance_aware_dbscan(xyz, DbscanParams(range_limits=(1.0,), eps=(0.3, 0.6), min_samples=min_samples))
     assert np.unique(banded[banded > 0]).tolist() == list(range(1, banded.max() + 1))
-
-
-def test_min_samples_1_gives_the_connected_components():
-    xyz = np.random.default_rng(2).uniform(-3, 3, (400, 3)).astype(np.float32)
-    labels = dbscan(xyz, 0.5, 1)
-    assert labels.min() == 1
-    pairs = cKDTree(xyz.astype(float)).query_pairs(0.5, output_type="ndarray")
-    assert len(pairs) and (labels[pairs[:, 0]] == labels[pairs[:, 1]]).all()
-    np.testing.assert_array_equal(labels, cluster_by_sklearn(xyz, 0.5, 1))
-
-
-def test_min_samples_above_point_count_gives_only_noise():
-    xyz = np.zeros((9, 3), np.float32)
-    assert not dbscan(xyz, 1.0, 10).any()
-    assert not dbscan(xyz, 1.0, 2**31 - 1).any()
-    assert not distance_aware_dbscan(xyz).any()
-
-
-CENTRES = np.array([[5, 3, 0], [6.5, -4, 0.5], [-9, 2, -1], [-20, -11, 0], [33, 20, 1], [1, 25, 0]])
-
-
-@pytest.mark.parametrize("turn", [[[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]])
-def test_quarter_turns_about_z_keep_the_clusters(turn):
-    xyz, _ = make_blobs(np.random.default_rng(11), CENTRES, 300, 0.25)
-    turned = xyz.copy()
-    turned[:, :2] = xyz[:, :2] @ np.array(turn, np.float32).T  # exact
-    labels = distance_aware_dbscan(xyz)
-    np.testing.assert_array_equal(distance_aware_dbscan(turned), labels)
-    assert labels.max() == len(CENTRES)
-
-
-@given(*[st.floats(-500, 500)] * 3)
-def test_translation_keeps_well_separated_clusters(x, y, z):
-    xyz, blob = make_blobs(np.random.default_rng(13), CENTRES, 60, 0.2)
-    labels = dbscan(xyz + np.float32([x, y, z]), 0.4, 5)
-    assert to_partition(labels) == to_partition(blob + 1)
 
 
 def test_layout_and_dtype_of_the_input_do_not_matter():

@@ -115,31 +115,6 @@ def test_real_scan_equals_the_plain_implementation(threshold, data):
     np.testing.assert_array_equal(cluster_euclidean(xyz, params), plain_euclidean(xyz, params))
 
 
-@pytest.mark.parametrize("params", SETTINGS, ids=SETTING_NAMES)
-def test_permuting_points_permutes_labels(params):
-    xyz, order = make_scene(5), np.random.default_rng(0).permutation(len(make_scene(5)))
-    a, b = cluster_euclidean(xyz, params)[order], cluster_euclidean(xyz[order], params)
-    assert is_same_partition(a, b)
-    first = b[np.sort(np.unique(b, return_index=True)[1])]
-    # Clusters are numbered by their first point.
-    assert np.array_equal(first[first > 0], np.arange(1, b.max() + 1))
-
-
-@pytest.mark.parametrize("params", SETTINGS[:2], ids=SETTING_NAMES[:2])
-def test_labels_do_not_depend_on_the_frame(params):
-    """The clusters are so far apart that rounding does not matter."""
-    xyz = make_blobs(3, [[0, 0, 0], [8, 0, 0], [0, 9, 1], [-7, -7, 0]])
-    turn = np.array([[np.cos(0.7), -np.sin(0.7), 0], [np.sin(0.7), np.cos(0.7), 0], [0, 0, 1]])
-    moved_xyz = (xyz.astype(float) @ turn.T + [30, -20, 1]).astype(np.float32)
-    labels = cluster_euclidean(xyz, params)
-    assert labels.max() >= 4
-    # Without merging, because its diameters are those of axis-aligned boxes and depend on the rotation.
-    unmerged = replace(params, gamma=0.0)
-    assert (cluster_euclidean(xyz, unmerged) == cluster_euclidean(moved_xyz, unmerged)).mean() > 0.999
-    shifted = cluster_euclidean(xyz + np.float32([16, -32, 0]), params)
-    np.testing.assert_array_equal(shifted > 0, labels > 0)
-
-
 def test_far_outliers_do_not_change_local_thresholds():
     xyz, far = make_scene(2), np.float32([[5e4, 0, 0], [0, -9e4, 10], [1e5, 1e5, 1e5]])
     # MinPts = beta ln N counts all points (Eq. 7); three more do not reach the next integer here.

@@ -35,7 +35,6 @@ from msg_utils.point_cloud2 import from_array
 ROBOTS = [(scene, kind) for scene in ("campus", "indoor") for kind in SCENE_TYPES[scene].kinds]
 TINY = make_generic_sensor(16, -15.0, 15.0, 2.0, 10.0, height=0.6)
 EXACT = replace(TINY, range_noise=0.0, dropout=0.0, divergence=0.0)
-PEOPLE = {CLASSES.index(name) for name in ("Pedestrian", "Person_sitting", "Cyclist")}
 SITTING, GROUND = CLASSES.index("Person_sitting"), (40, 44, 48, 72)
 make_cached_scene = cache(lambda scene, kind, seed=2: make_scene(seed, kind, 2.0, scene))
 

@@ -16,7 +16,6 @@ from lidar_perception.simulation.terrain import compute_ground_height
 from lidar_perception.types import CLASSES, PEDESTRIAN
 
 COARSE = replace(HDL64E, azimuth_step=float(np.radians(0.5)))
-EXACT = replace(COARSE, range_noise=0.0, dropout=0.0, divergence=0.0)
 pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("streets")]  # covered by other tests
 
 

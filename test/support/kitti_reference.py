@@ -9,10 +9,6 @@ import math
 
 import numpy as np
 
-MIN_OVERLAP = {
-    "strict": {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5},
-    "relaxed": {"Car": 0.5, "Pedestrian": 0.25, "Cyclist": 0.25},
-}
 LIMITS = {"easy": (40, 0, 0.15), "moderate": (25, 1, 0.30), "hard": (25, 2, 0.50)}
 NAMES = ("kind truncated occluded alpha left top right bottom h w l x y z ry score").split()
 
