@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
-from typing import Any, cast
+from typing import Any
 
 import yaml
 from rosbags.interfaces import Qos
@@ -121,19 +121,12 @@ def parse_profiles(profiles: Any) -> list[Qos]:
     """
     try:
         profiles = yaml.safe_load(profiles) if isinstance(profiles, str) else profiles
+        known_policies = [
+            {key: profile[key] for key in SENSOR_QOS if isinstance(profile.get(key), str | int)}
+            for profile in profiles or ()
+        ]
         # rosbags requires all policies (rosbags/rosbag2/metadata.py, parse_qos).
-        return parse_qos(
-            cast(
-                Any,
-                [
-                    {
-                        **SENSOR_QOS,
-                        **{key: profile[key] for key in SENSOR_QOS if isinstance(profile.get(key), str | int)},
-                        **_OTHER_POLICIES,
-                    }
-                    for profile in profiles or ()
-                ],
-            )
-        )
+        complete_profiles: Any = [complete_profile(SENSOR_QOS | policies) for policies in known_policies]
+        return parse_qos(complete_profiles)
     except (yaml.YAMLError, AttributeError, TypeError, ValueError):
         return []

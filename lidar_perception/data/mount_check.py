@@ -105,7 +105,8 @@ def find_mount_problem(recording: Recording, clouds: Sequence[PointCloud]) -> st
 
 def _find_floor(xyz: np.ndarray, params: ThresholdParams = FLOOR_PLANE) -> np.ndarray | None:
     """Return the plane z = a x + b y + c, (3,), of the ground in points (N, 3)."""
-    nearby_points = _select_nearby_points(xyz)
+    squared_range = np.einsum("ij,ij->i", xyz[:, :2], xyz[:, :2])
+    nearby_points = xyz.compress((squared_range >= MIN_RANGE_M**2) & (squared_range <= MAX_RANGE_M**2), axis=0)
     lowest = _find_lowest_points(nearby_points)
     if len(lowest) < MIN_CELLS:
         return None
@@ -116,12 +117,6 @@ def _find_floor(xyz: np.ndarray, params: ThresholdParams = FLOOR_PLANE) -> np.nd
         return None
     on_plane = np.abs(compute_height_above_plane(lowest, plane)) <= params.inlier_distance
     return plane if on_plane.mean() >= MIN_FLOOR_FRACTION else None
-
-
-def _select_nearby_points(xyz: np.ndarray) -> np.ndarray:
-    """Return the points (M, 3) between MIN_RANGE_M and MAX_RANGE_M."""
-    squared_range = np.einsum("ij,ij->i", xyz[:, :2], xyz[:, :2])
-    return xyz.compress((squared_range >= MIN_RANGE_M**2) & (squared_range <= MAX_RANGE_M**2), axis=0)
 
 
 def _find_lowest_points(nearby_points: np.ndarray) -> np.ndarray:

@@ -57,18 +57,12 @@ class GroundSegmentation(ManagedNode):
             indices, visible_frame = crop_to_view(frame, camera, params.view)
             visible_indices = cloud_indices.take(indices)
             if self.node_params.range == "all":
-                segmented_frame, indices, ground = (
-                    visible_frame,
-                    visible_indices,
-                    segment_ground(visible_frame, params.ground),
-                )
+                segmented_frame, indices = visible_frame, visible_indices
+                ground = segment_ground(visible_frame, params.ground)
             else:  # segmented as in the detector, with the same fallback
                 view = NormalizedView.of(visible_frame, params.ground.sensor_pose, **RANGES[self.node_params.range])
-                segmented_frame, indices, ground = (
-                    view.frame,
-                    visible_indices.take(view.indices),
-                    segment_view_ground(view.frame, params.ground),
-                )
+                segmented_frame, indices = view.frame, visible_indices.take(view.indices)
+                ground = segment_view_ground(view.frame, params.ground)
             in_view = scatter_values(OUT_OF_RANGE, visible_indices, msg, "u1")
             in_view[indices] = IN_VIEW
             self.points.publish(

@@ -60,11 +60,6 @@ class Output:
         if self.always_publishes or self.publisher.get_subscription_count():
             self.publisher.publish(to_cdr(message))
 
-    def close(self) -> None:
-        """End the links of this publisher."""
-        if self.links is not None:
-            self.links.remove(self)
-
 
 class Outputs:
     """The outputs of a node."""
@@ -86,9 +81,10 @@ class Outputs:
         return self.items[-1]
 
     def clear(self) -> None:
-        """Close and remove all outputs; their publishers are destroyed elsewhere."""
-        for output in self.items:
-            output.close()
+        """Remove all outputs and their links; their publishers are destroyed elsewhere."""
+        if self.links is not None:
+            for output in self.items:
+                self.links.remove(output)
         self.items = []
 
     def values(self) -> dict[str, Any]:

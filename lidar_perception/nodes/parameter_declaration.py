@@ -78,15 +78,11 @@ def _make_descriptor(f: Any, kind: Parameter.Type) -> ParameterDescriptor:
         if kind == Parameter.Type.DOUBLE:
             descriptor.floating_point_range = [
                 FloatingPointRange(
-                    from_value=float(-1e300 if low is None else low),
-                    to_value=float(1e300 if high is None else high),
-                    step=0.0,
+                    from_value=float(-1e300 if low is None else low), to_value=float(1e300 if high is None else high)
                 )
             ]
         elif kind == Parameter.Type.INTEGER:
             descriptor.integer_range = [
-                IntegerRange(
-                    from_value=-(2**62) if low is None else low, to_value=2**62 if high is None else high, step=0
-                )
+                IntegerRange(from_value=-(2**62) if low is None else low, to_value=2**62 if high is None else high)
             ]
     return descriptor

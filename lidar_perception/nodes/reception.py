@@ -275,18 +275,12 @@ class Reception:
         """Return the present problems of the topic with their remedies."""
         if not self.is_open:
             return []
-        problems, params = [], self.params()
-        publishers = self.list_publishers()
+        problems, params, publishers = list[Problem](), self.params(), self.list_publishers()
+        clouds = f"{self.what}s on {self.topic}"
         if len(publishers) > 1:
             names = ", ".join(sorted(_get_full_name(p) for p in publishers))
-            problems.append(
-                (
-                    "publishers",
-                    WARN,
-                    f"{len(publishers)} publishers on {self.topic} ({names}), "
-                    f"so their {self.what}s are mixed; remap all but one",
-                )
-            )
+            message = f"{len(publishers)} publishers on {self.topic} ({names}), so their {self.what}s are mixed; "
+            problems.append(("publishers", WARN, message + "remap all but one"))
         if problem := self._find_incompatible_publisher(publishers):
             problems.append(problem)
         if self.waiting and self.missing_input is not None:
@@ -294,50 +288,35 @@ class Reception:
             return [*problems, ("waiting", WARN, message)]
         if silence := self._find_silence():
             return [*problems, silence]
-        expected, rate = self.get_expected_rate(), self.arrivals.measure_rate()
-        if expected and rate and rate < params.min_rate * expected:
-            problems.append(
-                (
-                    "rate",
-                    WARN,
-                    f"{rate:.1f} Hz on {self.topic}, but {expected:.1f} Hz "
-                    f"are expected (input.rate): {self._list_hints()[1]}",
-                )
-            )
+        expected_rate, rate = self.get_expected_rate(), self.arrivals.measure_rate()
+        if expected_rate and rate and rate < params.min_rate * expected_rate:
+            message = f"{rate:.1f} Hz on {self.topic}, but {expected_rate:.1f} Hz are expected (input.rate): "
+            problems.append(("rate", WARN, message + self._list_hints()[1]))
         sent, lost, dropped = self.arrivals.count_recent()
         total = max(sent, WINDOW)  # so that one loss among the first two clouds does not count as 50 %
         if lost > params.max_lost * total:
             remedy = self._suggest_remedy(publishers or self.last_publishers)
-            problems.append(
-                ("lost", WARN, f"{lost} of the last {sent} {self.what}s on {self.topic} were lost in transit; {remedy}")
-            )
+            problems.append(("lost", WARN, f"{lost} of the last {sent} {clouds} were lost in transit; {remedy}"))
         if dropped > params.max_dropped * total:
-            problems.append(
-                (
-                    "dropped",
-                    WARN,
-                    f"{dropped} of the last {sent} {self.what}s on {self.topic} were dropped in "
-                    "favour of newer ones: this machine cannot process them as fast as they arrive, "
-                    "or they wait for poses",
-                )
+            message = (
+                f"{dropped} of the last {sent} {clouds} were dropped in favour of newer ones: this machine cannot "
+                "process them as fast as they arrive, or they wait for poses"
             )
+            problems.append(("dropped", WARN, message))
         return problems
 
     def _find_silence(self) -> Problem | None:
         """Return a problem if no cloud has arrived for longer than a slow sensor needs for one."""
-        params, expected = self.params(), self.get_expected_rate()
-        period = 1 / expected if expected else 0.0
+        params, expected_rate = self.params(), self.get_expected_rate()
+        period = 1 / expected_rate if expected_rate else 0.0
         silence = monotonic() - (self.last_time or monotonic())
         error_limit = max(params.error_after, SILENT_PERIODS * period)
         stale_limit = max(params.stale_after, STALE_PERIODS * period)
         if silence <= error_limit:
             return None
         kind, level, limit = ("stale", STALE, stale_limit) if silence > stale_limit else ("silent", ERROR, error_limit)
-        return (
-            kind,
-            level,
-            f"no {self.what} on {self.topic} for more than {round(limit, 1):g} s: {self._list_hints()[0]}",
-        )
+        message = f"no {self.what} on {self.topic} for more than {round(limit, 1):g} s: {self._list_hints()[0]}"
+        return kind, level, message
 
     def _list_hints(self) -> list[str]:
         """Return the hints of HINTS for the current publishers."""

@@ -20,25 +20,12 @@ from lidar_perception.types import MAX_NUMBER, InputError
 CHUNK_SIZE = 2**22  # characters read at a time; rows are shorter
 SEPARATORS = " \t\r\n,"
 MAX_TIME_US = 2**31 * 10**6  # maximum Unix time, limited by the seconds of a header
+STRING_FIELDS = (
+    "token sample_token instance_token scene_token sensor_token category_token ego_pose_token "
+    "calibrated_sensor_token prev next name channel filename"
+)
 TYPE_BY_FIELD: dict[str, type] = {
-    **dict.fromkeys(
-        (
-            "token",
-            "sample_token",
-            "instance_token",
-            "scene_token",
-            "sensor_token",
-            "category_token",
-            "ego_pose_token",
-            "calibrated_sensor_token",
-            "prev",
-            "next",
-            "name",
-            "channel",
-            "filename",
-        ),
-        str,
-    ),
+    **dict.fromkeys(STRING_FIELDS.split(), str),
     "timestamp": int,
     "attribute_tokens": list,
 }

@@ -195,22 +195,11 @@ class Evaluator(LidarNode):
         for name in self.frame_inputs:
             topic = self._join_topics([name])
             if (count := self.count_publishers(topic)) > 1:
-                problems.append(
-                    (
-                        f"publishers of {name}",
-                        WARN,
-                        f"{count} publishers on {topic}: only the first array of a frame is used; remap all but one",
-                    )
-                )
+                message = f"{count} publishers on {topic}: only the first array of a frame is used; remap all but one"
+                problems.append((f"publishers of {name}", WARN, message))
         if self.frame_mismatch:
-            problems.append(
-                (
-                    "frames",
-                    WARN,
-                    f"the compared boxes are in different frames: "
-                    f"{self.frame_mismatch}; publish both in the same frame (target_frame)",
-                )
-            )
+            message = f"the boxes are in different frames: {self.frame_mismatch}; publish them in one (target_frame)"
+            problems.append(("frames", WARN, message))
         if self.write_error:
             problems.append(("file", ERROR, f"{self.write_error}; retrying every {WRITE_PERIOD_S:g} s"))
         return problems
