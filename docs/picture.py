@@ -34,6 +34,7 @@ FINER = 2  # pictures are drawn at twice their size and reduced, for smooth poin
 README = Perspective((-9.0, -4.5, 5.2), (14.0, 1.6, -0.9), 58.0, 1600 * FINER, 720 * FINER)
 LOOK = Perspective((-12.0, -6.0, 8.0), (12.0, 1.0, -1.2), 60.0, 1600 * FINER, 800 * FINER)
 FILM_SIZE, FILM_PERIOD_MS = (720, 405), 100
+SENSORS, SENSOR_SIZE = ("Pandar64", "OS1-64", "HDL-32E", "VLP-16"), (800, 450)
 
 
 def draw(path: Path, view: Perspective, xyz: np.ndarray, colors: np.ndarray, found: Detections) -> None:
@@ -45,12 +46,12 @@ def draw(path: Path, view: Perspective, xyz: np.ndarray, colors: np.ndarray, fou
     write_png(path, np.asarray(Image.fromarray(canvas.pixels).reduce(FINER)))
 
 
-def detect_in_drive(folder: Path, simulation: list[str], detection: list[str]) -> None:
-    """Simulate a drive and run `detect --track` on it; results are in `folder`/out."""
-    drive = str(folder / "drive")
+def detect_in_drive(folder: Path, simulation: list[str], detection: list[str], name: str = "drive") -> None:
+    """Simulate a drive `folder`/`name` and run `detect` on it; results are in `folder`/out."""
+    drive = str(folder / name)
     for words in (
         ["simulate", "--out", drive, *simulation],
-        ["detect", drive, "--out", str(folder / "out"), "--track", *detection],
+        ["detect", drive, "--out", str(folder / "out"), *detection],
     ):
         with suppress(SystemExit):
             cli(words, standalone_mode=False)
@@ -60,7 +61,7 @@ def draw_detect(path: Path) -> None:
     """Draw the last frame of a simulated drive by `detect --track --png`."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        detect_in_drive(folder, ["--frames", "20", "--seed", "4"], ["--png"])
+        detect_in_drive(folder, ["--frames", "20", "--seed", "4"], ["--track", "--png"])
         path.write_bytes(sorted((folder / "out/png").rglob("*.png"))[-1].read_bytes())
 
 
@@ -71,7 +72,7 @@ def draw_film(path: Path) -> None:
         detect_in_drive(
             folder,
             ["--frames", "40", "--seed", str(SEED), "--kind", "zone", "--people", "2"],
-            ["--range", "around", "--video", str(folder / "film.webp")],
+            ["--track", "--range", "around", "--video", str(folder / "film.webp")],
         )
         with Image.open(folder / "film.webp") as film:
             frames = [
@@ -81,6 +82,26 @@ def draw_film(path: Path) -> None:
         frames[0].save(
             path, save_all=True, append_images=frames[1:], duration=FILM_PERIOD_MS, loop=0, quality=40, method=4
         )
+
+
+def draw_sensors(path: Path) -> None:
+    """Draw a scan of the same street by each of SENSORS, with labels and detections, by `detect --png`."""
+    width, height = SENSOR_SIZE
+    picture = Image.new("RGB", (2 * width, 2 * height))
+    for i, sensor in enumerate(SENSORS):
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            detect_in_drive(
+                folder,
+                ["--sensor", sensor, "--frames", "1", "--seed", str(SEED), "--kind", "zone", "--people", "3"],
+                ["--range", "around", "--png"],
+                sensor,
+            )
+            (drawing,) = (folder / "out/png").rglob("*.png")
+            with Image.open(drawing) as frame:
+                reduced = frame.convert("RGB").resize(SENSOR_SIZE, Image.Resampling.LANCZOS)
+            picture.paste(reduced, (i % 2 * width, i // 2 * height))
+    picture.save(path, quality=75, method=6)
 
 
 def make(folder: Path = FOLDER) -> None:
@@ -104,6 +125,7 @@ def make(folder: Path = FOLDER) -> None:
     )
     draw_detect(folder / "detect.png")
     draw_film(folder / "detect.webp")
+    draw_sensors(folder / "sensors.webp")
 
 
 if __name__ == "__main__":
