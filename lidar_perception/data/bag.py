@@ -345,7 +345,7 @@ class Bag:
             return
         read_counts = Counter[int]()
         try:
-            for topic_id, time, data in file.messages(name_by_id, start, stop):
+            for topic_id, time, data in file.read_messages(name_by_id, start, stop):
                 read_counts[topic_id] += 1
                 yield name_by_id[topic_id], time, decompress_message(data)
             for topic in file.topics if start <= self.start_ns and stop == END else ():

@@ -89,21 +89,21 @@ class McapFile:
     def close(self) -> None:
         self.file.close()
 
-    def messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
+    def read_messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
         """Yield (channel id, log time, data) of channels with start <= time < stop, in order of time."""
         channels = {*ids}
         sources: list[tuple[int, Callable[[], Stream]]] = [
-            (chunk.start, partial(self._messages_in_chunk, chunk, channels, start, stop))
+            (chunk.start, partial(self._read_messages_in_chunk, chunk, channels, start, stop))
             for chunk in self.chunks
             if chunk.start < stop and start <= chunk.end and not channels.isdisjoint(chunk.counts)
         ]
         if len(self.locations):
             sources.append(
-                (int(self.locations["time"][0]), partial(self._messages_outside_chunks, channels, start, stop))
+                (int(self.locations["time"][0]), partial(self._read_messages_outside_chunks, channels, start, stop))
             )
         return merge_streams(sources)
 
-    def _messages_in_chunk(self, chunk: Chunk, channels: set[int], start: int, stop: int) -> Stream:
+    def _read_messages_in_chunk(self, chunk: Chunk, channels: set[int], start: int, stop: int) -> Stream:
         data, messages = self._read_chunk(chunk), []
         for record_type, offset, length in _iterate_records(partial(_slice, data), 0, len(data)):
             if record_type == MESSAGE:
@@ -116,7 +116,7 @@ class McapFile:
         for time, channel, begin, end in messages:
             yield channel, time, data[begin:end]
 
-    def _messages_outside_chunks(self, channels: set[int], start: int, stop: int) -> Stream:
+    def _read_messages_outside_chunks(self, channels: set[int], start: int, stop: int) -> Stream:
         begin, end = np.searchsorted(self.locations["time"], (start, stop))
         for time, channel, offset, size in self.locations[begin:end].tolist():
             if channel in channels:

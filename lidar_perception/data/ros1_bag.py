@@ -60,7 +60,7 @@ class Ros1File:
     def close(self) -> None:
         self.reader.close()
 
-    def messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
+    def read_messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
         """Yield (topic id, time, CDR bytes) of topics with start <= time < stop, in order of time."""
         connections = [self.connection_by_id[topic_id] for topic_id in ids]
         for connection, time, data in self.reader.messages(connections, start, stop):

@@ -37,7 +37,7 @@ class SqliteFile:
     def close(self) -> None:
         self.database.close()
 
-    def messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
+    def read_messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
         """Yield (topic id, time, data) of topics with start <= time < stop, in order of time."""
         for topic, time, data in self.database.execute(
             f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN "

@@ -44,7 +44,7 @@ class StorageFile(Protocol):
     topics: list[Topic]
     times: tuple[int, int] | None
 
-    def messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
+    def read_messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
         """Yield the messages of topics with start <= time < stop, in order of time."""
 
     def close(self) -> None:

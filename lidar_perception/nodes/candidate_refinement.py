@@ -49,7 +49,7 @@ class CandidateRefinement(ManagedNode):
                 )
             ids, numbers = clusters
             ground = np.zeros(len(ids), bool) if ground is None else ground > 0
-            segmented = SegmentedCloud(
+            segmented_cloud = SegmentedCloud(
                 indices,
                 frame.xyz,
                 ground,
@@ -58,4 +58,4 @@ class CandidateRefinement(ManagedNode):
                 numbers,
                 frame.intensity,
             )
-            self.results.publish(msg.header, frame.xyz, lambda: refine_segmented(segmented, source, self.params))
+            self.results.publish(msg.header, frame.xyz, lambda: refine_segmented(segmented_cloud, source, self.params))

@@ -218,10 +218,10 @@ class SeedInput:
         while len(self.new_clicks) > self.params.bank:
             self.new_clicks.popleft()
 
-    def _make_clicked_seeds(self, header: Any, segmented: SegmentedCloud) -> tuple[Seed, ...]:
+    def _make_clicked_seeds(self, header: Any, segmented_cloud: SegmentedCloud) -> tuple[Seed, ...]:
         while self.new_clicks:
             try:
-                seed = self._make_clicked_seed(self.new_clicks[0], header, segmented)
+                seed = self._make_clicked_seed(self.new_clicks[0], header, segmented_cloud)
             except InputError:
                 if len(self.new_clicks) == 1:  # report the problem until the next click
                     raise
@@ -236,7 +236,7 @@ class SeedInput:
             )
         return self.clicked_seeds
 
-    def _make_clicked_seed(self, click: Any, header: Any, segmented: SegmentedCloud) -> Seed:
+    def _make_clicked_seed(self, click: Any, header: Any, segmented_cloud: SegmentedCloud) -> Seed:
         p, frame_id = click.point, click.header.frame_id
         try:
             pose = self.node.transforms.to_level(header, frame_id)
@@ -246,7 +246,7 @@ class SeedInput:
                 "set the fixed frame of the viewer to the cloud's frame and click again"
             ) from None
         point = transform_points(np.array([[p.x, p.y, p.z]]), pose)[0]
-        (seed,) = make_click_source(point, self.params)(segmented)
+        (seed,) = make_click_source(point, self.params)(segmented_cloud)
         self.node.get_logger().info(f"seed selected at ({p.x:.1f}, {p.y:.1f}, {p.z:.1f}), height {seed.height:.2f} m")
         return seed
 
@@ -254,7 +254,7 @@ class SeedInput:
 def _make_failing_source(reason: str) -> SeedSource:
     """Return a seed source that raises InputError with this reason."""
 
-    def raise_error(segmented: SegmentedCloud) -> tuple[Seed, ...]:
+    def raise_error(segmented_cloud: SegmentedCloud) -> tuple[Seed, ...]:
         raise InputError(reason)
 
     return raise_error

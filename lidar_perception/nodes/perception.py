@@ -47,21 +47,23 @@ class Perception(ManagedNode):
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.diagnostics.measure_frame(to_ns(msg.header.stamp)):
             frame, cloud_indices, params = self.sensor.read_frame(msg)
-            segmented = segment_cloud(frame, self.camera.get(msg.header, params.view), params)
-            problem = diagnose_empty(len(frame), segmented.ground, segmented.cluster_ids) or self.sensor.find_problem(
-                frame, params
+            segmented_cloud = segment_cloud(frame, self.camera.get(msg.header, params.view), params)
+            problem = diagnose_empty(
+                len(frame), segmented_cloud.ground, segmented_cloud.cluster_ids
+            ) or self.sensor.find_problem(frame, params)
+            self.results.publish(
+                msg.header, frame.xyz, lambda: refine_segmented(segmented_cloud, source, params), problem
             )
-            self.results.publish(msg.header, frame.xyz, lambda: refine_segmented(segmented, source, params), problem)
-        indices = cloud_indices.take(segmented.indices)
+        indices = cloud_indices.take(segmented_cloud.indices)
         if self.points.get_subscription_count():
             self.points.publish(
                 add_columns(
                     msg,
                     make_bag_message,
-                    ground=scatter_values(segmented.ground, indices, msg, "u1"),
+                    ground=scatter_values(segmented_cloud.ground, indices, msg, "u1"),
                     in_view=scatter_values(1, indices, msg, "u1"),
-                    cluster_id=scatter_values(segmented.cluster_ids, indices, msg, "u4"),
+                    cluster_id=scatter_values(segmented_cloud.cluster_ids, indices, msg, "u4"),
                 )
             )
-        self.boxes.publish(msg.header, lambda: segmented.boxes)
-        self.obstacles.publish(msg, segmented.xyz, segmented.ground, indices)
+        self.boxes.publish(msg.header, lambda: segmented_cloud.boxes)
+        self.obstacles.publish(msg, segmented_cloud.xyz, segmented_cloud.ground, indices)

@@ -36,7 +36,7 @@ class MissingTransform(InputError):
 
 
 class _Link:
-    """Poses of a frame in its parent: one static pose, the recent poses, or all poses."""
+    """Poses of a frame in its parent: a single static pose, or poses over time (all, or only recent ones)."""
 
     def __init__(self, parent: str, static: bool, keeps_all: bool):
         self.parent, self.static, self.keeps_all = parent, static, keeps_all

@@ -67,9 +67,9 @@ class Tables:
             try:
                 values = tuple([row[field] for field in fields])
             except (KeyError, TypeError):
-                missing = next(f for f in fields if not isinstance(row, dict) or f not in row)
+                missing_field = next(f for f in fields if not isinstance(row, dict) or f not in row)
                 raise InputError(
-                    f"{self.get_path(table)}: row {number} has no {missing}, so it is not a table of nuScenes; "
+                    f"{self.get_path(table)}: row {number} has no {missing_field}, so it is not a table of nuScenes; "
                     "download it again"
                 ) from None
             for column, type_ in typed_columns:

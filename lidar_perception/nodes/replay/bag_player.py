@@ -113,13 +113,13 @@ class BagPlayer(LidarNode):
                 )
         return full_names
 
-    def _expand_name(self, name: str, what: str) -> str:
+    def _expand_name(self, name: str, source: str) -> str:
         """Return the full name of a topic; relative names are in the namespace of the node."""
         try:
             return self.resolve_topic_name(name, only_expand=True)
         except (ValueError, RuntimeError, NameValidationException) as error:
             reason = " ".join(str(error).split())
-            raise InputError(f"{what}: '{name}' is not a valid topic name ({reason})") from None
+            raise InputError(f"{source}: '{name}' is not a valid topic name ({reason})") from None
 
     def _parse_wait_for(self) -> dict[str, int]:
         """Return {topic: number of subscribers to wait for}."""
@@ -184,14 +184,14 @@ class BagPlayer(LidarNode):
     def _wait_until_connected(self) -> None:
         give_up = monotonic() + self.params.wait_timeout
         while not self.stop.done():
-            missing = [t for t, count in self.awaited_counts.items() if self._count_subscribers(t) < count]
-            missing += [t for t in self.params.follow if not self.count_publishers(t)]
-            if not missing:
+            missing_topics = [t for t, count in self.awaited_counts.items() if self._count_subscribers(t) < count]
+            missing_topics += [t for t in self.params.follow if not self.count_publishers(t)]
+            if not missing_topics:
                 return
             if monotonic() > give_up:
                 self.diagnostics.report(
                     WARN,
-                    f"too few subscribers of {', '.join(missing)} (or publishers of "
+                    f"too few subscribers of {', '.join(missing_topics)} (or publishers of "
                     f"topics in follow) after {self.params.wait_timeout:g} s; playing "
                     "anyway",
                 )
