@@ -257,10 +257,10 @@ def test_unusable_first_scenes_are_skipped(kind, tmp_path, one_thread):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("part", ["_make_plan", "_prepare_scenes"])
+@pytest.mark.parametrize("part", ["Planner.make_plan", "fill_cache"])
 def test_stopped_preparation_explains_resume(tmp_path, monkeypatch, part, number):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # as in test_training.py
-    monkeypatch.setattr(start, part, lambda *_: signal.raise_signal(number))
+    monkeypatch.setattr(f"{start.__name__}.{part}", lambda *_: signal.raise_signal(number))
     try:
         result = CliRunner().invoke(cli, small_training(tmp_path / "run"))
     finally:
@@ -273,7 +273,7 @@ def test_run_is_not_resumed_with_changed_split_or_weights(tmp_path, monkeypatch)
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(start, "_prepare_scenes", stop)
+    monkeypatch.setattr(start, "fill_cache", stop)
     split = write_file(tmp_path / "split.txt", "000000\n000001\n000002\n")
     init = Path(shutil.copy(find_pointnet_weights(PointNetParams()), tmp_path / "init.safetensors"))
     arguments = [
