@@ -367,3 +367,9 @@ class GroundTruth:
     def select_class(self, class_id: int) -> np.ndarray:
         """Return the boxes (M, 7) of one class."""
         return self.boxes[self.class_ids == class_id]
+
+    def take(self, indices: np.ndarray) -> GroundTruth:
+        """Return the objects with these indices or in this mask (K,) bool, and all notes."""
+        indices = np.arange(len(self))[indices]
+        extras = tuple(self.extras[i] for i in indices)
+        return GroundTruth(self.boxes[indices], self.class_ids[indices], extras, self.notes)

@@ -30,12 +30,12 @@ def find_labelled(truth: GroundTruth) -> np.ndarray:
 
 def select_labels_in_view(truth: GroundTruth) -> GroundTruth:
     """Return the labelled objects whose centre is in the image of FORWARD_CAMERA."""
-    return _select(truth, FORWARD_CAMERA.camera().in_view(truth.boxes[:, :3]) & find_labelled(truth))
+    return truth.take(FORWARD_CAMERA.camera().in_view(truth.boxes[:, :3]) & find_labelled(truth))
 
 
 def select_labels(truth: GroundTruth) -> GroundTruth:
     """Return the objects in all directions that are visible enough for a label."""
-    return _select(truth, find_labelled(truth))
+    return truth.take(find_labelled(truth))
 
 
 def make_kitti_labels(truth: GroundTruth, camera: Calibration = FORWARD_CAMERA) -> GroundTruth:
@@ -44,17 +44,7 @@ def make_kitti_labels(truth: GroundTruth, camera: Calibration = FORWARD_CAMERA) 
     It has the objects that are at least partly in the image. Those that are not visible enough for a
     label become DontCare regions, as notes.
     """
-    in_image = keep_visible_objects(truth, camera)
-    labelled = find_labelled(in_image)
-    notes = [
-        ("DontCare", {**DONT_CARE, "bbox": extra["bbox"]})
-        for extra, is_labelled in zip(in_image.extras, labelled)
-        if not is_labelled
-    ]
-    objects = _select(in_image, labelled)
-    return GroundTruth.of(objects.boxes, objects.class_ids, objects.extras, notes)
-
-
-def _select(truth: GroundTruth, mask: np.ndarray) -> GroundTruth:
-    indices = np.flatnonzero(mask)
-    return GroundTruth.of(truth.boxes[indices], truth.class_ids[indices], [truth.extras[i] for i in indices])
+    objects = keep_visible_objects(truth, camera)
+    is_labelled = find_labelled(objects)
+    notes = [("DontCare", {**DONT_CARE, "bbox": extra["bbox"]}) for extra in objects.take(~is_labelled).extras]
+    return replace(objects.take(is_labelled), notes=tuple(notes))

@@ -130,8 +130,7 @@ def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> 
 
 def select_in_image(truth: GroundTruth, calibration: Calibration | None) -> GroundTruth:
     """Return the labels that are at least partly in the image, or all labels without a calibration."""
-    rows = np.flatnonzero(to_camera_objects(truth, calibration).pixels_high[: len(truth)] > 0)
-    return GroundTruth.of(truth.boxes[rows], truth.class_ids[rows], [truth.extras[i] for i in rows], truth.notes)
+    return truth.take(to_camera_objects(truth, calibration).pixels_high[: len(truth)] > 0)
 
 
 def _make_without_camera(objects: GroundTruth, scores: np.ndarray) -> CameraObjects:

@@ -45,7 +45,7 @@ from lidar_perception.training.data import SceneReader, load_items
 from lidar_perception.training.database import Database, paste_objects
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.pasting import find_points_in_box
-from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, GroundTruth, InputError, PointCloud
+from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, InputError, PointCloud
 
 # Boxes with low scores are omitted: they hardly change the AP, but take time.
 VALIDATION_PARAMS = DetectorParams(
@@ -213,9 +213,7 @@ def load_validation_frame(config: NetworkConfig, source: Any, i: int) -> Frame:
     frame = source.load_frame(i)
     truth, calibration = frame.truth(), frame.calibration()
     if calibration is None and truth is not None:
-        indices = np.flatnonzero(is_within(truth.boxes, config.low, config.high))
-        extras = [truth.extras[k] for k in indices]
-        truth = GroundTruth.of(truth.boxes[indices], truth.class_ids[indices], extras, truth.notes)
+        truth = truth.take(is_within(truth.boxes, config.low, config.high))
     return Frame.of(frame.name, frame.load(), truth, calibration, sensor_height=frame.sensor_height)
 
 
