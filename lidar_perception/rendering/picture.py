@@ -31,6 +31,10 @@ RING_POINTS = 180  # number of points with which a range ring is drawn
 MIN_RANGE, MAX_RANGE_AHEAD, MAX_RANGE_AROUND = 6.0, 55.0, 45.0  # limits of the displayed range in metres
 POINT_RADIUS_FRACTION = 5e-4  # radius of a point as a fraction of the displayed range
 FOV = 60.0  # horizontal field of view in degrees
+# Eye (x, y, z) and target (x, y) of the perspective view, and x of the centre and height of the bird's-eye view,
+# as fractions of the displayed range.
+AHEAD_VIEW = (-0.2, -0.045, 0.12), (0.24, 0.01), 0.44, 1.14
+AROUND_VIEW = (-0.5, -0.1, 0.4), (0.02, 0.0), 0.0, 2.1
 RANGE_PERCENTILE = 98  # percentile of the points' ranges that is chosen as displayed range
 BEV_FRACTION = 0.375  # fraction of the width used by the bird's-eye view
 CLASS_COLOR_WEIGHT = 0.5  # weight of the class colour in the colour of points in boxes
@@ -92,25 +96,17 @@ class RenderSettings:
         """Perspective view from behind the sensor, and bird's-eye view."""
         extent, right_width = self.reach, round(self.width * BEV_FRACTION)
         left_width = self.width - right_width
-        if self.ahead:
-            perspective = Perspective(
-                (-0.2 * extent, -0.045 * extent, 0.12 * extent),
-                (0.24 * extent, 0.01 * extent, self.ground),
-                FOV,
-                left_width,
-                self.height,
-                POINT_RADIUS_FRACTION * extent,
-            )
-            return perspective, BirdsEye((0.44 * extent, 0.0), self.height / (1.14 * extent), right_width, self.height)
+        eye, target, centre_x, height = AHEAD_VIEW if self.ahead else AROUND_VIEW
         perspective = Perspective(
-            (-0.5 * extent, -0.1 * extent, 0.4 * extent),
-            (0.02 * extent, 0.0, self.ground),
+            (eye[0] * extent, eye[1] * extent, eye[2] * extent),
+            (target[0] * extent, target[1] * extent, self.ground),
             FOV,
             left_width,
             self.height,
             POINT_RADIUS_FRACTION * extent,
         )
-        return perspective, BirdsEye((0.0, 0.0), self.height / (2.1 * extent), right_width, self.height)
+        scale = self.height / (height * extent)
+        return perspective, BirdsEye((centre_x * extent, 0.0), scale, right_width, self.height)
 
     @property
     def ring_radii(self) -> np.ndarray:

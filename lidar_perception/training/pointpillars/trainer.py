@@ -23,7 +23,6 @@ from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.detectors.weights_file import find_pointpillars_weights
 from lidar_perception.training.cut_objects import CutObjects, cut_objects, join_databases
 from lidar_perception.training.data import Item, SceneReader, Stream
-from lidar_perception.training.database import Database
 from lidar_perception.training.params import PointPillarsTraining
 from lidar_perception.training.plan import Speed
 from lidar_perception.training.pointpillars.task import (
@@ -76,27 +75,23 @@ class PointPillarsTrainer:
         self, params: PointPillarsTraining, scenes: Iterable[Item], val_sources: Sequence[Any], device: torch.device
     ) -> Speed:
         """Measure the speed on the first usable scenes, with objects that are cut from them."""
-
-        def cut_all() -> list[Database]:
-            return [cut_objects(scene, self.config.classes, params.data.min_points) for scene in usable_scenes]
-
-        reduced = reduce_range(
+        config = reduce_range(
             self.config, **(self.find_reduced_range(params) or {"ahead": params.ahead, "aside": params.aside})
         )
-        prepare = ScenePreparation(reduced, params.augment, params.data.min_points)
+        prepare = ScenePreparation(config, params.augment, params.data.min_points)
         usable_scenes = select_usable_scenes(scenes, lambda scene: prepare(scene, np.random.default_rng(0)))
-        cut_objects(usable_scenes[0], self.config.classes, params.data.min_points)  # triggers compilation
-        cutting, databases = measure_duration(cut_all)
+        cut = partial(cut_objects, classes=config.classes, min_points=params.data.min_points)
+        cut(usable_scenes[0])  # triggers compilation
+        cutting, databases = measure_duration(lambda: [cut(scene) for scene in usable_scenes])
         network = self.make_network().to(device)
         with tempfile.TemporaryDirectory() as folder:
             join_databases(databases).save(Path(folder) / OBJECTS)
-            prepare_pasted = replace(
-                prepare, database=Path(folder) / OBJECTS if self.find_max_cut_scenes(params) else None
-            )
+            if self.find_max_cut_scenes(params):
+                prepare = replace(prepare, database=Path(folder) / OBJECTS)
             step = measure_step(
                 network,
-                make_loss(reduced, device),
-                lambda: [prepare_pasted(scene, np.random.default_rng(0)) for scene in usable_scenes],
+                make_loss(config, device),
+                lambda: [prepare(scene, np.random.default_rng(0)) for scene in usable_scenes],
                 params,
                 device,
             )
@@ -104,7 +99,7 @@ class PointPillarsTrainer:
         frame = find_readable_frame(
             self._make_reader(val_sources), lambda frame: detect_in_frame(frame, detector).problem is None
         )
-        full_range_step = step * np.prod(self.config.grid) / np.prod(reduced.grid)
+        full_range_step = step * np.prod(self.config.grid) / np.prod(config.grid)
         validation, _ = measure_duration(lambda: detect_in_frame(frame, detector))
         return Speed(cutting / len(usable_scenes), step, float(full_range_step), validation)
 
