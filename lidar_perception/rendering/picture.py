@@ -292,11 +292,7 @@ def _has_room(view: View, pixel: np.ndarray) -> bool:
 def _draw_legend(
     canvas: Canvas, settings: RenderSettings, boxes: Boxes, labels: np.ndarray, with_scale: bool
 ) -> list[Text]:
-    """Draw the legend: classes with box counts, the dashed line of labels, and the colour scale.
-
-    Returns:
-        The texts to draw on top.
-    """
+    """Draw the legend: box counts of classes, labels, and colour scale. Return the texts to draw on top."""
     items, x, y = [], 18.0, settings.height - 20.0
     entries = [
         (f"{CLASSES[c]} {np.count_nonzero(boxes.class_ids == c)}", get_class_color(c), False)

@@ -276,16 +276,10 @@ def _make_side_curb(
     sidewalk_width: float,
     parking_width: float,
 ) -> Side:
-    """Return one curb of a side street.
+    """Return one curb of a side street, at x.
 
-    Args:
-        front: Type of the buildings or plants beyond the sidewalk.
-        x: x of the curb, m.
-        front_direction: 1 or -1, side of the front along x.
-        street_curb: y of the main street's curb at which the side street begins, m.
-        direction: 1 or -1, direction of the side street along y.
-        sidewalk_width: Width of the main street's sidewalk, m.
-        parking_width: Width of the parking strip, m.
+    The side street begins at the main street's curb (y) and continues in `direction` along y. The front of
+    the curb is on the side `front_direction` along x.
     """
     start = street_curb + direction * (sidewalk_width + 9.0)
     return Side(

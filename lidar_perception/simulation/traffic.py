@@ -141,11 +141,7 @@ def _fill_side_street(rng, crossing: tuple[float, float], ground) -> Iterator[Ac
 
 
 def _park_vehicles(rng, side: Side, occupancy: float) -> Iterator[Actor]:
-    """Yield parked vehicles: along the curb, in driveways, and in car parks behind the sidewalk.
-
-    Args:
-        occupancy: Fraction of the parking spaces that are occupied.
-    """
+    """Yield vehicles parked at the curb, in driveways and in car parks; `occupancy` is the used fraction."""
 
     def make_parked_vehicle():
         pick = rng.random()

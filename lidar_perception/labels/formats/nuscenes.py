@@ -124,11 +124,7 @@ def _parse_velocity(velocity: Any) -> list[float] | None:
 
 
 def _to_local_box(row: dict[str, Any], pose: np.ndarray) -> tuple[list[float], bool]:
-    """Transform a global box to the frame with this pose.
-
-    Returns:
-        The box, and True if it is tilted in that frame.
-    """
+    """Return a box in the frame with this pose, and True if it is tilted in that frame."""
     width, length, height = row["size"]
     box = GlobalBoxes.of([row["translation"]], [[length, width, height]], [row["rotation"]], 0)
     if not are_valid_rotations(box.rotations).all():
@@ -203,14 +199,7 @@ def _make_columns(
 def _compute_velocities(
     labels: DriveLabels, frames: Sequence[Frame], poses: dict[int, np.ndarray]
 ) -> dict[tuple[int, int], list[float]]:
-    """Compute velocities in the global frame from the previous and next box of each track.
-
-    Args:
-        poses: Pose of each frame with boxes.
-
-    Returns:
-        Velocity [x y] in m/s by (position of the frame, index of the box).
-    """
+    """Return the velocity [x y] in m/s of box k in frame i by (i, k), from the previous and next box of its track."""
     tracks: dict[tuple[str, int], list[tuple[int, int]]] = {}
     for i, (frame_labels, frame) in enumerate(zip(labels.frames, frames)):
         for k, track in enumerate(frame_labels.track_ids.tolist()):

@@ -70,11 +70,7 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
 
 
 def _read_drive(path: Path, frames: list[Frame]) -> tuple[list[FrameLabels], dict[str, Any]]:
-    """Read the file of a drive.
-
-    Returns:
-        The labels of each frame, and the other content of the file.
-    """
+    """Return the labels of each frame in the file of a drive, and the other content of the file."""
     content, source = dict(read_json(path)[ROOT]), str(path)
     objects, systems = content.get("objects", {}), content.get("coordinate_systems", {})
     frame_contents = content.get("frames", {})
@@ -163,14 +159,7 @@ def _parse_track(cuboid: dict[str, Any], object_class: str, number: int) -> tupl
 
 
 def _parse_extra(cuboid: dict[str, Any], box: list[float], is_plain: bool) -> dict[str, Any]:
-    """Return the extra fields of a cuboid.
-
-    Args:
-        cuboid: Cuboid in the file.
-        box: Box made from the cuboid.
-        is_plain: True if the box describes the cuboid completely; otherwise the original cuboid is
-            one of the fields.
-    """
+    """Return the extra fields of a cuboid, with the original cuboid unless the box describes it completely."""
     values, other_items = parts.parse_named_values(cuboid.get("attributes", {}))
     extra = {name: v for name, v in values.items() if name not in (SCORE, TRACKED, TYPE)}
     extra |= {OTHER: other_items} if other_items else {}
@@ -194,11 +183,8 @@ def _make_content(
 ) -> dict[str, Any]:
     """Return the content of the file of a drive.
 
-    Args:
-        labels: Labels of all frames.
-        frames: All frames.
-        positions: Positions of the drive's frames in `frames`.
-        original: Content of the file that was read, without cuboids; {} if no file was read.
+    `positions` are the positions of the drive's frames in `frames`; `original` is the content of the file
+    that was read, without cuboids, or {}.
     """
     drive_frames = [(frames[i], labels.frames[i]) for i in positions]
     named_tracks = collect_track_names((frame_labels for _, frame_labels in drive_frames), UID)

@@ -154,16 +154,7 @@ def measure_coverage(
 def _select_body(
     scans: Sequence[Scan], labels: Sequence[np.ndarray], body: np.ndarray, median: np.ndarray
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Select the points on the body.
-
-    Args:
-        labels: Row of each point of each scan.
-        body: (R, 360) bool, cells of the body.
-        median: (R, 360) median range of each cell, m.
-
-    Returns:
-        A mask (N,) for each scan, and the box (6,) around the selected points, empty without points.
-    """
+    """Return a mask (N,) of the points on the body for each scan, and the box (6,) around them, empty if none."""
     masks = [
         _look_up(scan, label, body, False)
         & (np.abs(scan.range - _look_up(scan, label, median, 0.0)) < 3 * MAX_BODY_VARIATION_M)

@@ -36,13 +36,7 @@ def make_truck(rng: np.random.Generator) -> SceneObject:
 def _make_truck_parts(
     length: float, width: float, load_height: float, cab_height: float, colour: float, cargo: float
 ) -> np.ndarray:
-    """Return the parts of a truck.
-
-    Args:
-        length, width: Size in m.
-        load_height, cab_height: Heights of the load and the cab, m.
-        colour, cargo: Reflectances of the cab and the load.
-    """
+    """Return the parts of a truck; `colour` and `cargo` are the reflectances of the cab and the load."""
     x, y, radius, floor = length / 2, width / 2, 0.48, 1.15
     back, belt, roof = x - min(2.2, 0.24 * length), 0.62 * cab_height, cab_height - 0.25
     transmission = 0.75  # fraction of beams that pass through the windows
@@ -98,12 +92,7 @@ def _make_coach_parts(
 ) -> np.ndarray:
     """Return the parts of a bus or tram: body with windows and pillars, seats and wheels.
 
-    Args:
-        size: Length, width, height in m.
-        colour: Reflectance of the body.
-        semantic: SemanticKITTI class.
-        radius: Radius of the wheels, m.
-        axles: Positions of the axles from the tail, as fractions of the length.
+    `axles` are the positions of the axles from the tail, as fractions of the length.
     """
     length, width, height = size
     x, y = length / 2, width / 2
