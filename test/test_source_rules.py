@@ -56,6 +56,12 @@ def test_source_files_have_at_most_400_lines(name):
     assert len((ROOT / name).read_text(encoding="utf-8").splitlines()) <= 400
 
 
+@for_all(TESTS)
+def test_names_of_tests_have_at_most_60_characters(name):
+    functions = (node.name for node in ast.walk(parse_source(name)) if isinstance(node, ast.FunctionDef))
+    assert [function for function in functions if function.startswith("test_") and len(function) > 60] == []
+
+
 def test_constants_of_clustering_have_unique_names():
     """Modules import constants from each other, so equal names would be ambiguous."""
     files_by_name = {}

@@ -25,7 +25,7 @@ def scan():
     return simulate_scan(4, 0, HDL64E, Scenes(None, 12.0))
 
 
-def test_automatic_seeds_are_pedestrians_with_descending_confidence(scan):
+def test_automatic_seeds_are_pedestrians_by_confidence(scan):
     seeds = make_automatic_source(SeedParams(min_confidence=0.8))(segment_cloud(scan.frame, params=PARAMS))
     confidences = [seed.confidence for seed in seeds]
     assert len(seeds) >= 3
