@@ -305,14 +305,14 @@ def test_core_functions_without_numba_have_types(name):
     """mypy would also require types in functions for Numba, which ignores them (setup.cfg)."""
 
     def has_types(node):
-        named = [
+        arguments = [
             *node.args.posonlyargs,
             *node.args.args,
             *node.args.kwonlyargs,
             *filter(None, (node.args.vararg, node.args.kwarg)),
         ]
         return (node.returns or node.name == "__init__") and all(
-            a.annotation or a.arg in ("self", "cls") for a in named
+            a.annotation or a.arg in ("self", "cls") for a in arguments
         )
 
     assert [

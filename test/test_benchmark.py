@@ -131,13 +131,13 @@ def test_every_version_is_timed_step_by_step_on_random_weights(one_thread, capsy
     monkeypatch.setattr(pointpillars, "run_experts", seen)
     content = measure_detection([PointCloud(points[:, :3], points[:, 3])], 1, ("compact",))
     print_detection(json.loads(json.dumps(content)))
-    shown = capsys.readouterr().out
+    output = capsys.readouterr().out
     versions = content["sizes"]["compact"]["versions"]
     assert list(versions) == ["v0", "v1", "v2", "v3", "v4"] and versions["v0"]["to_v0"] == 1.0
     for name, found in versions.items():
         assert sum(found["share"].values()) == pytest.approx(1.0)
         assert found["ms"]["network"] > 0 and found["ms"]["postprocess"] > 0
-        assert name in shown and found["to_v0"] == found["total_ms"] / versions["v0"]["total_ms"]
+        assert name in output and found["to_v0"] == found["total_ms"] / versions["v0"]["total_ms"]
         assert found["ms"]["experts"] >= 0
     # Steps that a version does not need are not timed.
     assert ran == {"v0": (False, False), "v1": (True, False), **dict.fromkeys(("v2", "v3", "v4"), (True, True))}
@@ -166,8 +166,8 @@ def test_pointnet_is_timed_against_a_plain_network(one_thread, capsys):
     points = make_scene()
     content = measure_pointnet([PointCloud(points[:, :3], points[:, 3])] * 2, 1)
     print_pointnet(json.loads(json.dumps(content)))
-    shown = capsys.readouterr().out
-    assert all(name in shown for name in ("improved PointNet", "plain PointNet++", "clustering"))
+    output = capsys.readouterr().out
+    assert all(name in output for name in ("improved PointNet", "plain PointNet++", "clustering"))
     assert content["clusters"] >= 1 and all(value > 0 for value in content["ms"].values())
     # The plain PointNet++ uses farthest point sampling and ball queries.
     xyz = torch.tensor([[[0.0, 0, 0], [5, 0, 0], [0.1, 0, 0], [0, 0.3, 0]]])
@@ -208,10 +208,10 @@ def test_graph_table_has_speed_and_cpu_time(drive_bag, monkeypatch, capsys):
     from benchmark.graph import RUNS, measure_graph, print_graph
     from lidar_perception.nodes.replay import graph_replay
 
-    asked = []
+    calls = []
 
     def replay(drive, clouds, out, **arguments):
-        asked.append(arguments)
+        calls.append(arguments)
         return {
             "clouds": clouds,
             "results": clouds - 1,
@@ -224,7 +224,7 @@ def test_graph_table_has_speed_and_cpu_time(drive_bag, monkeypatch, capsys):
 
     monkeypatch.setattr(graph_replay, "replay", replay)
     runs = measure_graph(open_recording(drive_bag))
-    assert [*runs] == [*RUNS] and asked == [arguments for arguments, _ in RUNS.values()]
+    assert [*runs] == [*RUNS] and calls == [arguments for arguments, _ in RUNS.values()]
     assert {(run["speed"], run["cpu_ms"]) for run in runs.values()} == {(0.25, 160.0)}
     print_graph(runs)
     assert "0.25x" in capsys.readouterr().out

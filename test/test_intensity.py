@@ -81,8 +81,8 @@ def test_few_invalid_values_do_not_change_the_scale():
 
 def test_to_unit_keeps_regular_values_and_zeroes_invalid_ones():
     assert to_unit(UNIT, 1.0).tobytes() == UNIT.tobytes()
-    odd = to_unit(np.array([np.nan, np.inf, -np.inf, -3, 1e300, 0, 51, 510]), 255)
-    assert odd.dtype == np.float32 and np.allclose(odd, [0, 0, 0, 0, 0, 0, 0.2, 2])
+    values = to_unit(np.array([np.nan, np.inf, -np.inf, -3, 1e300, 0, 51, 510]), 255)
+    assert values.dtype == np.float32 and np.allclose(values, [0, 0, 0, 0, 0, 0, 0.2, 2])
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2], [2, 0, 1], [1, 2, 0]])
@@ -212,8 +212,8 @@ def test_intensity_scale_is_declared_or_inferred_from_the_type():
         PointCloud.of(np.column_stack([xyz, raw]), intensity_max=255),
     ):
         assert np.array_equal(frame.intensity, expected)
-    odd = PointCloud.of(xyz[:3], [np.nan, -1, 0.5]).intensity
-    assert odd.tolist() == [0, 0, 0.5]
+    intensity = PointCloud.of(xyz[:3], [np.nan, -1, 0.5]).intensity
+    assert intensity.tolist() == [0, 0, 0.5]
     for wrong, said in (
         (dict(intensity=raw[:9]), r"\(9,\) for 400 points"),
         (dict(intensity=raw[:, None]), r"\(400, 1\) for 400"),

@@ -141,10 +141,10 @@ def test_each_field_is_documented(group, f):
 
 @each_params
 def test_with_values_inverts_flatten(kind):
-    changed = with_values(kind(), {n: other_value(f) for n, f in collect_fields(kind()).items()})
-    assert changed != kind()
-    assert with_values(kind(), flatten(changed)) == changed
-    assert flatten(with_values(kind(), flatten(changed))) == flatten(changed)
+    changed_params = with_values(kind(), {n: other_value(f) for n, f in collect_fields(kind()).items()})
+    assert changed_params != kind()
+    assert with_values(kind(), flatten(changed_params)) == changed_params
+    assert flatten(with_values(kind(), flatten(changed_params))) == flatten(changed_params)
 
 
 @each_params

@@ -102,9 +102,9 @@ def test_load_seed_inverts_save_seed(tmp_path_factory, seed, tenth_mm, count):
     xyz = np.float32(np.round(rng.uniform(-90, 90, (count, 3)), 4))
     path = tmp_path_factory.mktemp("seed") / "folder/template.json"
     save_seed(Seed(xyz, -1.7321, tenth_mm / 10_000), path)
-    loaded = load_seed(path)
-    np.testing.assert_array_equal(loaded.xyz, xyz)
-    assert (loaded.floor, loaded.height) == (-1.7321, tenth_mm / 10_000)
+    loaded_seed = load_seed(path)
+    np.testing.assert_array_equal(loaded_seed.xyz, xyz)
+    assert (loaded_seed.floor, loaded_seed.height) == (-1.7321, tenth_mm / 10_000)
 
 
 POINTS = [[5.0, 0.1 * i, -1.0] for i in range(10)]

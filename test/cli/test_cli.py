@@ -80,10 +80,10 @@ def test_convert_limit_restricts_the_number_of_frames(kitti, tmp_path):
 
 def test_convert_skips_and_reports_broken_frames(tmp_path, monkeypatch, capsys):
     root = write_object_folder(tmp_path / "kitti", LABELS)
-    broken = write_file(root / "training/velodyne/000000.bin", b"123")
+    broken_file = write_file(root / "training/velodyne/000000.bin", b"123")
     assert run_main(monkeypatch, "convert", root, "--out", tmp_path / "bag") == 1
     text = capsys.readouterr().out.replace("\n", "")
-    assert "1 scans of 2" in text and str(broken) in text
+    assert "1 scans of 2" in text and str(broken_file) in text
     with Bag(tmp_path / "bag") as opened:
         assert opened.counts[POINTS] == 1
 

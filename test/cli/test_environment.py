@@ -89,8 +89,8 @@ def test_concurrent_first_calls_create_one_environment(tmp_path):
 @pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
 def test_sourced_ros_does_not_affect_the_new_environment(tmp_path):
     """pip does not install packages that it finds on PYTHONPATH."""
-    seen = tmp_path / "seen"
-    python = write_file(tmp_path / "python", f"#!/bin/sh\necho ${{PYTHONPATH-unset}} >>{seen}\n")
+    log_file = tmp_path / "seen"
+    python = write_file(tmp_path / "python", f"#!/bin/sh\necho ${{PYTHONPATH-unset}} >>{log_file}\n")
     python.chmod(0o755)
     done = subprocess.run(
         [ROOT / "lidar", "info"],
@@ -104,7 +104,7 @@ def test_sourced_ros_does_not_affect_the_new_environment(tmp_path):
         },
     )
     assert done.returncode == 1 and "installation failed" in done.stderr  # this Python cannot create environments
-    assert seen.read_text().split() == ["unset", "unset"]
+    assert log_file.read_text().split() == ["unset", "unset"]
 
 
 @pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")

@@ -55,9 +55,9 @@ def test_set_help_of_candidates_describes_every_parameter():
     ],
 )
 def test_set_changes_parameters_of_the_pipeline(bag, tmp_path, flags):
-    changed = drop_times(evaluate(tmp_path, "--data", bag, *make_set_options(*flags)))
-    assert changed["ground_truth"] == 2
-    assert changed != drop_times(evaluate(tmp_path, "--data", bag))
+    changed_scores = drop_times(evaluate(tmp_path, "--data", bag, *make_set_options(*flags)))
+    assert changed_scores["ground_truth"] == 2
+    assert changed_scores != drop_times(evaluate(tmp_path, "--data", bag))
 
 
 @pytest.mark.no_cover

@@ -80,9 +80,9 @@ def test_border_points_join_the_first_cluster(min_samples):
     rng = np.random.default_rng(3)
     xyz, _ = make_blobs(rng, [[0, 0, 0], [0.9, 0, 0], [0, 0.9, 0], [0.9, 0.9, 0.2]], 40, 0.25)
     bridge = rng.uniform(-0.2, 1.1, (60, 3)).astype(np.float32)
-    mixed = rng.permutation(np.concatenate([xyz, bridge]))
+    points = rng.permutation(np.concatenate([xyz, bridge]))
     for eps in (0.15, 0.25, 0.35):
-        assert_same(mixed, eps, min_samples)
+        assert_same(points, eps, min_samples)
 
 
 @pytest.mark.parametrize(
@@ -178,10 +178,10 @@ def join_bands_slowly(xyz, labels, params):
 def test_join_bands_joins_only_touching_clusters(seed, count):
     rng = np.random.default_rng(seed)
     xyz = (rng.uniform(-6, 6, (count, 3)) * [1, 1, 0.1]).astype(np.float32)
-    cut = DbscanParams(range_limits=(2.0, 4.0), eps=(0.9, 0.7, 1.0), min_samples=3)
-    labels = distance_aware_dbscan(xyz, cut)
-    result = distance_aware_dbscan(xyz, DbscanParams(cut.range_limits, cut.eps, 3, join_bands=True))
-    assert to_partition(result) == join_bands_slowly(xyz, labels, cut)
+    params = DbscanParams(range_limits=(2.0, 4.0), eps=(0.9, 0.7, 1.0), min_samples=3)
+    labels = distance_aware_dbscan(xyz, params)
+    result = distance_aware_dbscan(xyz, DbscanParams(params.range_limits, params.eps, 3, join_bands=True))
+    assert to_partition(result) == join_bands_slowly(xyz, labels, params)
     np.testing.assert_array_equal(result > 0, labels > 0)
     first = [np.flatnonzero(result == k)[0] for k in range(1, result.max(initial=0) + 1)]
     assert len(set(result.tolist()) - {0}) == len(first)

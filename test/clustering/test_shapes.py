@@ -38,8 +38,8 @@ def make_clusters(seed):
             flat = np.round(flat * 2) / 2  # ties and coincident points
         parts.append(np.column_stack([rotate(flat, rng.uniform(-4, 4)) + rng.uniform(-60, 60, 3), np.full(size, k)]))
     noise = np.column_stack([rng.uniform(-60, 60, (20, 3)), np.zeros(20)])
-    mixed = rng.permutation(np.concatenate([noise, *parts]))
-    return mixed[:, :3].astype(np.float32), mixed[:, 3].astype(np.int32)
+    points = rng.permutation(np.concatenate([noise, *parts]))
+    return points[:, :3].astype(np.float32), points[:, 3].astype(np.int32)
 
 
 def apply_to_one(function, xyz, *rest):

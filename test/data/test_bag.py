@@ -205,8 +205,8 @@ def test_frames_can_be_loaded_in_any_order_thread_and_process(sample_bag, tmp_pa
 def test_raw_messages_are_selected_by_topic_and_time(sample_bag):
     rows = message_bytes(sample_bag)
     with Bag(sample_bag) as bag:
-        chosen = {POINTS, TRUTH}
-        assert list(bag.raw_messages(chosen)) == [row for row in rows if row[0] in chosen]
+        topics = {POINTS, TRUTH}
+        assert list(bag.raw_messages(topics)) == [row for row in rows if row[0] in topics]
         assert list(bag.raw_messages(set())) == []
         low, high = STAMP + 1, STAMP + 2 * 10**8
         assert list(bag.raw_messages(None, low, high)) == [r for r in rows if low <= r[1] < high]

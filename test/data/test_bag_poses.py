@@ -74,12 +74,12 @@ def test_odometry_of_another_frame_is_transformed_to_the_sensor(tmp_path):
 
 
 def test_poses_of_clouds_in_the_odometry_frame_are_identity(tmp_path):
-    still = write_robot_bag(
+    recording = write_robot_bag(
         tmp_path / "bag",
         make_odometry_rows(ODOMETRY),
         cloud=lambda stamp: make_cloud_message(np.ones((3, 4)), stamp, "odom"),
     )
-    assert all(np.array_equal(frame.pose(), np.eye(4)) for frame in still)
+    assert all(np.array_equal(frame.pose(), np.eye(4)) for frame in recording)
 
 
 def test_converted_bag_has_sensor_odometry(tmp_path):

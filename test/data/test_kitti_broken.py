@@ -45,13 +45,13 @@ def test_invalid_file_affects_only_its_frame(tmp_path, file, content, words):
     path.unlink()
     if content is not None:
         write_file(path, content)
-    broken, good = open_recording(root)
+    broken_frame, valid_frame = open_recording(root)
     with pytest.raises(InputError) as error:
-        read_frame(broken)
+        read_frame(broken_frame)
     assert str(path) in str(error.value) and words in str(error.value)
     assert "\n" not in str(error.value)
-    read_frame(good)
-    assert good.name == "000001"
+    read_frame(valid_frame)
+    assert valid_frame.name == "000001"
 
 
 @pytest.mark.parametrize(

@@ -124,10 +124,10 @@ WORLD = np.random.default_rng(1).uniform(-20, 20, (400, 3)) + [1, 0, 0]
 def make_moving_cloud(stamp):
     """Return the cloud of static points, measured while the sensor moves for 0.1 s."""
     seconds = np.linspace(0, 0.1, len(WORLD))
-    measured = [
+    points = [
         invert_pose(compute_base_pose(stamp + t * 1e9) @ ON_BASE) @ [*point, 1] for point, t in zip(WORLD, seconds)
     ]
-    return make_cloud_message(np.array(measured)[:, :3], stamp, "lidar", time=seconds.astype(np.float32))
+    return make_cloud_message(np.array(points)[:, :3], stamp, "lidar", time=seconds.astype(np.float32))
 
 
 @pytest.mark.parametrize("moves", [make_odometry_rows(ODOMETRY), make_tf_rows()], ids=["odometry", "TF"])

@@ -43,7 +43,7 @@ def make_points(n=200):
 
 def compress_lzf(data):
     """Compress with greedy LZF: references to earlier runs of at least three bytes, literals otherwise."""
-    out, literal, seen, i = bytearray(), bytearray(), {}, 0
+    out, literal, positions, i = bytearray(), bytearray(), {}, 0
 
     def flush():
         for k in range(0, len(literal), 32):
@@ -53,9 +53,9 @@ def compress_lzf(data):
 
     while i < len(data):
         key, length = data[i : i + 3], 0
-        back = i - seen.get(key, -1) - 1
-        if len(key) == 3 and key in seen and back < 8192:
-            start = seen[key]
+        back = i - positions.get(key, -1) - 1
+        if len(key) == 3 and key in positions and back < 8192:
+            start = positions[key]
             while i + length < len(data) and length < 264 and (data[start + length] == data[i + length]):
                 length += 1
             flush()
@@ -64,10 +64,10 @@ def compress_lzf(data):
             if short == 7:
                 out.append(length - 9)
             out.append(back & 255)
-            seen[key] = i
+            positions[key] = i
             i += length
         else:
-            seen[key] = i
+            positions[key] = i
             literal.append(data[i])
             i += 1
     flush()
@@ -114,8 +114,8 @@ def test_pcd_file_returns_the_written_points(tmp_path, kind):
     path.write_bytes(format_pcd(make_points(), kind))
     assert read_pcd(path).dtype.names == make_points().dtype.names
     assert np.array_equal(read_pcd(path), make_points())
-    for cut in (0, 40, len(path.read_bytes()) // 2):
-        path.write_bytes(format_pcd(make_points(), kind)[:cut])
+    for length in (0, 40, len(path.read_bytes()) // 2):
+        path.write_bytes(format_pcd(make_points(), kind)[:length])
         with pytest.raises(InputError, match=r"one\.pcd") as error:
             read_pcd(path)
         assert "\n" not in str(error.value)
@@ -255,12 +255,12 @@ def test_files_are_ordered_by_time_or_number(names, timed, tmp_path):
 
 def test_evenly_spaced_pairs_of_clouds_are_chosen():
     assert choose_clouds(5, 10) == [0, 1, 2, 3, 4]
-    chosen = choose_clouds(1000, 40)
-    assert len(chosen) == 40 and chosen[:2] == [0, 1] and chosen[-1] == 999
-    assert np.diff(chosen)[::2].tolist() == [1, 8] * 10 and (np.diff(chosen)[1::2] > 40).all()
+    indices = choose_clouds(1000, 40)
+    assert len(indices) == 40 and indices[:2] == [0, 1] and indices[-1] == 999
+    assert np.diff(indices)[::2].tolist() == [1, 8] * 10 and (np.diff(indices)[1::2] > 40).all()
     assert choose_clouds(3, 1) == [0] and choose_clouds(1, 1) == [0]
     for count in range(1, 60):
-        for wanted in range(1, 45):
-            chosen = choose_clouds(count, wanted)
-            assert chosen == sorted({*chosen}) and chosen[0] == 0 and chosen[-1] < count
-            assert len(chosen) <= wanted and (count == 1 or len(chosen) > 1 or wanted == 1)
+        for max_count in range(1, 45):
+            indices = choose_clouds(count, max_count)
+            assert indices == sorted({*indices}) and indices[0] == 0 and indices[-1] < count
+            assert len(indices) <= max_count and (count == 1 or len(indices) > 1 or max_count == 1)

@@ -79,8 +79,8 @@ def test_damaged_bag_is_reported_in_one_line(drive_bag, tmp_path):
     whole = as_ros1(drive_bag, tmp_path / "whole.bag").read_bytes()
     rng = np.random.default_rng(0)
     (tmp_path / "text.bag").write_bytes(b"text " * 100)
-    for i, cut in enumerate([*rng.integers(0, len(whole), 12).tolist(), len(whole) - 1]):
-        (tmp_path / f"{i}.bag").write_bytes(whole[:cut])
+    for i, length in enumerate([*rng.integers(0, len(whole), 12).tolist(), len(whole) - 1]):
+        (tmp_path / f"{i}.bag").write_bytes(whole[:length])
     for path in [tmp_path / "text.bag", *(tmp_path / f"{i}.bag" for i in range(13))]:
         with pytest.raises(InputError, match="truncated or damaged") as error:
             [frame.load() for frame in open_recording(path)]

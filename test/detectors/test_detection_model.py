@@ -328,8 +328,8 @@ def test_pillars_of_single_and_batched_clouds_are_equal(changes):
     points[4, 3] = np.nan
     points = np.column_stack([points, rng.integers(0, 9, 5000)]).astype(np.float32)
     cloud = torch.from_numpy(points[:, : config.point_columns].copy())
-    alone = make_pillars(cloud.numpy(), config)
+    single = make_pillars(cloud.numpy(), config)
     several = make_pillar_batch([cloud, cloud[:0]], config)
-    assert 0 < len(alone.points) < 5000
-    for ours, theirs in zip(alone[:3], several[:3]):
+    assert 0 < len(single.points) < 5000
+    for ours, theirs in zip(single[:3], several[:3]):
         assert np.array_equal(ours, theirs)

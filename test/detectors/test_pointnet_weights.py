@@ -54,11 +54,11 @@ def copy_with_header(path, out, **changes):
 def test_checkpoint_survives_saving_and_loading(checkpoints, tmp_path):
     path, pointpillars_path, header = checkpoints
     assert read_header(path) == header and header.network == "pointnet"
-    loaded_header, loaded = load_pointnet(path, header.config)
+    loaded_header, loaded_network = load_pointnet(path, header.config)
     assert loaded_header == header
     for name, value in make_random_network(header.config).state_dict().items():
-        assert torch.equal(loaded.state_dict()[name], value), name
-    save_checkpoint(tmp_path / "half", loaded, header, half=True)
+        assert torch.equal(loaded_network.state_dict()[name], value), name
+    save_checkpoint(tmp_path / "half", loaded_network, header, half=True)
     assert (tmp_path / "half").stat().st_size < path.stat().st_size
     detector = load_pointnet_detector(path, "cpu", accept_every_cluster())
     assert are_equal_detections(detector(make_scan()), make_random_detector()(make_scan()), 1e-5)

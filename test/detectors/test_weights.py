@@ -61,10 +61,10 @@ def checkpoint(tmp_path):
 def test_checkpoint_survives_saving_and_loading(checkpoint, tmp_path):
     path, header, network = checkpoint
     assert read_header(path) == header
-    loaded_header, loaded = load_network(path, header.config)
+    loaded_header, loaded_network = load_network(path, header.config)
     assert loaded_header == header
     for name, value in network.state_dict().items():
-        assert torch.equal(loaded.state_dict()[name], value), name
+        assert torch.equal(loaded_network.state_dict()[name], value), name
     save_checkpoint(tmp_path / "half", network, header, half=True)
     assert (tmp_path / "half").stat().st_size < path.stat().st_size
     for name, value in load_network(tmp_path / "half")[1].state_dict().items():

@@ -103,9 +103,9 @@ def test_report_is_complete_with_and_without_records(frames):
     records = [SEGMENTATION.measure(frames, i) for i in range(2)]
     for record in records:
         for counts in (*record["methods"].values(), *record["sweeps"].values()):
-            named = dict(zip(COUNT_COLUMNS, counts, strict=True))
-            limit = min(named["found object points"], named["object points"])
-            assert named["right object points"] <= limit <= named["points"]
+            count_by_name = dict(zip(COUNT_COLUMNS, counts, strict=True))
+            limit = min(count_by_name["found object points"], count_by_name["object points"])
+            assert count_by_name["right object points"] <= limit <= count_by_name["points"]
     for some in ([], [{"frame": "x", "skipped": "why"}], records):
         sections = SEGMENTATION.make_sections(some)
         tables = [table for section in sections for table in section.tables]

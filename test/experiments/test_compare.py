@@ -92,9 +92,9 @@ def test_all_detectors_run_and_missing_ones_are_listed(package_without_weights, 
         assert row.keys() == ROW and row["ms"] > 0 and row["frames"] == len(row["ms_of_frames"])
         labelled = name.startswith("STM-CPA") and not name.endswith("auto")
         assert row["frames"] + len(row["failed"]) == (2 if labelled else 3)
-        used, best = (row["pedestrian_centres"][key] for key in ("operating", "best"))
-        assert used["tp"] + used["fn"] == best["tp"] + best["fn"] == 8
-        assert used["f1"] <= best["f1"]
+        operating, best = (row["pedestrian_centres"][key] for key in ("operating", "best"))
+        assert operating["tp"] + operating["fn"] == best["tp"] + best["fn"] == 8
+        assert operating["f1"] <= best["f1"]
         assert (row["classes"] == ["Pedestrian"]) == name.startswith("STM-CPA")
         assert (row["mean_ap"]["3d"] is None) == name.startswith("STM-CPA")
         assert name in text

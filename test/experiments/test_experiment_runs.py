@@ -151,17 +151,17 @@ def test_truncated_last_record_is_measured_again(five_scans, tmp_path, cut):
 def test_finished_frames_are_not_measured_again(five_scans, tmp_path, monkeypatch):
     expected = run_experiment(SMALL, open_recording(five_scans), tmp_path / "out", limit=2)
     assert [r["frame"] for r in expected] == ["000000", "000001"]
-    asked = []
+    requests = []
 
     def log_measure(frames, number):
-        asked.append(number)
+        requests.append(number)
         return count_points(frames, number)
 
     recording, out = open_recording(five_scans), tmp_path / "out"
     assert run_experiment(make_small_experiment(log_measure), recording, out)[:2] == expected
-    assert asked == [2, 3, 4]
+    assert requests == [2, 3, 4]
     assert len(run_experiment(make_small_experiment(log_measure), recording, out, limit=1)) == 1
-    assert asked == [2, 3, 4]
+    assert requests == [2, 3, 4]
     assert len(read_lines(tmp_path / "out")) == 1 + 4  # the plan, and frames that were not skipped
 
 

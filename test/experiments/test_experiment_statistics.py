@@ -71,9 +71,9 @@ def test_interval_covers_truth_at_its_level():
 def test_bootstrap_weights_sum_to_the_number_of_blocks():
     """Sums of one-hot frames count how often each frame was drawn."""
     counts = np.eye(6)
-    seen = []
-    bootstrap(counts, lambda sums: seen.append(sums) or sums[..., :1])
-    drawn = seen[1]
+    sums_of_calls = []
+    bootstrap(counts, lambda sums: sums_of_calls.append(sums) or sums[..., :1])
+    drawn = sums_of_calls[1]
     assert drawn.shape == (BootstrapParams().replicates, 6) and (drawn.sum(axis=1) == 6).all()
     assert (drawn == drawn.astype(int)).all()
     np.testing.assert_allclose(drawn.mean(axis=0), 1, atol=0.1)
@@ -107,8 +107,8 @@ def test_intervals_of_an_array_equal_those_of_its_elements():
     together = bootstrap(counts, lambda sums: compute_rates(*np.moveaxis(sums, -2, 0)))
     assert together.shape == (3, 4, 3)
     for k in range(4):
-        alone = bootstrap(counts[:, :, k], lambda sums: compute_rates(*np.moveaxis(sums, -1, 0)))
-        np.testing.assert_allclose(together[:, k], alone)
+        single = bootstrap(counts[:, :, k], lambda sums: compute_rates(*np.moveaxis(sums, -1, 0)))
+        np.testing.assert_allclose(together[:, k], single)
 
 
 @given(st.integers(0, 50), st.integers(0, 50), st.integers(0, 50))

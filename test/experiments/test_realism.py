@@ -118,9 +118,9 @@ def test_ground_is_found_below_a_low_sensor():
     for frame in map(make_scan, range(SCANS)):
         scan = frame.load()
         lower.append(Frame.of(frame.name, replace(scan, xyz=scan.xyz + up), sensor_height=0.7))
-    measured = measure_scans(lower, PAPER)
+    measurement = measure_scans(lower, PAPER)
     for curve in ("clusters", "person clusters"):
-        np.testing.assert_array_equal(measured.rows[curve], measure_street().rows[curve])
+        np.testing.assert_array_equal(measurement.rows[curve], measure_street().rows[curve])
 
 
 def test_removing_points_changes_counts_and_not_sizes():
@@ -186,30 +186,30 @@ def test_empty_scans_are_excluded():
     none = PointCloud(np.zeros((0, 3), np.float32))
     empty = Frame.of("0", none, GroundTruth.of([], []), CALIBRATION)
     for scans in ([], [empty], [Frame.of("0", none, None, CALIBRATION)]):
-        measured = measure_scans(scans, PAPER)
-        content = compare_scans(measured, measured)
+        measurement = measure_scans(scans, PAPER)
+        content = compare_scans(measurement, measurement)
         assert (content["judged"], content["share"]) == (0, None)
         print_realism(content, Console(file=StringIO()))
 
 
 def test_scans_without_intensity_have_all_other_curves():
     bare = [Frame.of(r.name, replace(r.load(), intensity=None), r.truth()) for r in map(make_scan, range(2))]
-    measured = measure_scans(bare, replace(PAPER, view=replace(PAPER.view, enabled=False)))
+    measurement = measure_scans(bare, replace(PAPER, view=replace(PAPER.view, enabled=False)))
     assert all(
         (len(rows) == 0) == (name in LIGHT)
-        for name, rows in measured.rows.items()
+        for name, rows in measurement.rows.items()
         if not name.startswith(("stage", "final")) and name not in FACES
     )
 
 
 def test_cropped_scan_contributes_only_its_objects():
     whole = make_scan(0)
-    seen = np.flatnonzero(whole.camera().in_view(whole.load().xyz))
-    cropped = replace_scan(whole, whole.load().take(seen))
+    in_view = np.flatnonzero(whole.camera().in_view(whole.load().xyz))
+    cropped = replace_scan(whole, whole.load().take(in_view))
     assert is_full_scan(whole.load()) and not is_full_scan(cropped.load())
-    measured = measure_scans([cropped], PAPER)
-    assert (measured.scans, measured.full_scans) == (1, 0)
-    assert all(not measured.rows[name] for name in ("points", "clusters", "ground intensity"))
+    measurement = measure_scans([cropped], PAPER)
+    assert (measurement.scans, measurement.full_scans) == (1, 0)
+    assert all(not measurement.rows[name] for name in ("points", "clusters", "ground intensity"))
     expected = compute_rows(whole)
     assert all(np.array_equal(rows, expected[name], equal_nan=True) for name, rows in compute_rows(cropped).items())
 
@@ -262,8 +262,8 @@ def test_solid_angle_of_a_box_follows_its_visible_size():
     upright = np.array([20.0, 0, 0, 0.5, 0.5, 1.7, 0])
     expected = np.degrees(0.5 / 20) * np.degrees(1.7 / 20)
     assert compute_square_degrees(upright) == pytest.approx(expected, rel=0.01)
-    turned = np.array([0, 20.0, 0, 0.5, 0.5, 1.7, np.pi / 2])
-    assert compute_square_degrees(turned) == pytest.approx(compute_square_degrees(upright))
+    rotated_box = np.array([0, 20.0, 0, 0.5, 0.5, 1.7, np.pi / 2])
+    assert compute_square_degrees(rotated_box) == pytest.approx(compute_square_degrees(upright))
     side, behind = (np.array([20.0, 0, 0, 4, 2, 1.5, yaw]) for yaw in (np.pi / 2, 0))
     assert compute_square_degrees(side) == pytest.approx(2 * compute_square_degrees(behind), rel=0.01)
 
@@ -303,9 +303,9 @@ def test_comparison_survives_json_and_is_printed():
     content = compare_scans(measure_street(), measure_scans(map(make_scan, range(3)), PAPER))
     parsed = json.loads(json.dumps(content, allow_nan=False))
     assert parsed == content
-    shown = StringIO()
-    print_realism(parsed, Console(file=shown, width=100))
-    assert f"{content['within']} of {content['judged']} bins" in shown.getvalue()
+    output = StringIO()
+    print_realism(parsed, Console(file=output, width=100))
+    assert f"{content['within']} of {content['judged']} bins" in output.getvalue()
 
 
 def tracking_folder(root):
@@ -317,9 +317,9 @@ def tracking_folder(root):
 
 @pytest.mark.parametrize("make", [lambda root: write_object_folder(root, make_walker_label(), 1), tracking_folder])
 def test_object_and_tracking_folders_are_read(tmp_path, make):
-    measured = measure_scans(select_frames(open_recording(make(tmp_path))), PAPER)
-    assert measured.objects == {"Car": 0, "Pedestrian": 1, "Cyclist": 0}
-    assert (measured.scans, measured.full_scans, measured.skipped) == (1, 1, [])
+    measurement = measure_scans(select_frames(open_recording(make(tmp_path))), PAPER)
+    assert measurement.objects == {"Car": 0, "Pedestrian": 1, "Cyclist": 0}
+    assert (measurement.scans, measurement.full_scans, measurement.skipped) == (1, 1, [])
 
 
 def test_folders_without_labels_are_rejected(tmp_path):
@@ -333,9 +333,9 @@ def test_folders_without_labels_are_rejected(tmp_path):
 def test_broken_scans_are_skipped_and_counted(tmp_path):
     scans = sorted(write_object_folder(tmp_path, make_walker_label(), 3).rglob("velodyne/*.bin"))
     write_file(scans[1], b"cut")
-    measured = measure_scans(select_frames(open_recording(tmp_path)), PAPER)
-    assert measured.scans == 2 and len(measured.skipped) == 1
-    assert compare_scans(measured, measured)["real"]["skipped"] == measured.skipped
+    measurement = measure_scans(select_frames(open_recording(tmp_path)), PAPER)
+    assert measurement.scans == 2 and len(measurement.skipped) == 1
+    assert compare_scans(measurement, measurement)["real"]["skipped"] == measurement.skipped
     for scan in scans:
         write_file(scan, b"cut")
     with pytest.raises(InputError, match=r"cannot read any of the 3 scans: .*000000.bin"):
@@ -345,8 +345,8 @@ def test_broken_scans_are_skipped_and_counted(tmp_path):
 def test_frames_of_large_folder_are_evenly_spaced(tmp_path):
     recording = open_recording(write_object_folder(tmp_path, make_walker_label(), 1))
     many = [replace(recording.frames[0], name=str(i)) for i in range(3 * MAX_SCANS)]
-    chosen = select_frames(replace(recording, frames=many))
-    numbers = [int(f.name) for f in chosen]
+    selected_frames = select_frames(replace(recording, frames=many))
+    numbers = [int(f.name) for f in selected_frames]
     assert len(numbers) == MAX_SCANS
     assert (numbers[0], numbers[-1]) == (0, len(many) - 1) and set(np.diff(numbers)) <= {3, 4}
 

@@ -35,9 +35,9 @@ def test_cells_with_objects_are_not_ground():
     ground = make_plane(2)
     post = np.column_stack([np.full(200, 4.5), np.full(200, 4.5), np.linspace(-1.7, 0.3, 200)])
     few = np.column_stack([np.full(2, -4.5), np.full(2, 4.5), [0.5, 1.0]])
-    alone, _ = measure_cell_scatter(ground)
+    ground_scatter, _ = measure_cell_scatter(ground)
     middle, scatter = measure_cell_scatter(np.concatenate([ground, post, few]))
-    assert len(middle) == len(alone) - 1 and scatter.max() < 1e-4
+    assert len(middle) == len(ground_scatter) - 1 and scatter.max() < 1e-4
 
 
 def test_order_and_height_offset_do_not_matter():

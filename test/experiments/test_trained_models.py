@@ -148,12 +148,12 @@ def test_command_trains_and_measures_on_other_scans(tmp_path, listed_models):
 def test_frames_of_a_recording_are_used_once(tmp_path, listed_models):
     folder = write_object_folder(tmp_path / "kitti", make_walker_label(), count=6)
     scenes = ExperimentScenes.split(str(folder))
-    used = [*scenes.train, *scenes.val, *scenes.test]
-    assert sorted(used) == [f"{i:06}" for i in range(6)]
+    all_frames = [*scenes.train, *scenes.val, *scenes.test]
+    assert sorted(all_frames) == [f"{i:06}" for i in range(6)]
     assert [len(scenes.select_labelled(share)) for share in (1.0, 0.5, 0.01)] == [4, 2, 1]
     assert {*scenes.select_labelled(0.5)} < {*scenes.train}
-    chosen = ExperimentScenes.split(str(folder), write_file(tmp_path / "test.txt", "000001\n000003\n"))
-    assert chosen.test == ("000001", "000003")
+    split_scenes = ExperimentScenes.split(str(folder), write_file(tmp_path / "test.txt", "000001\n000003\n"))
+    assert split_scenes.test == ("000001", "000003")
     result = run(folder, "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output
     assert (tmp_path / "out/models/train-50.txt").read_text().split() == [*scenes.select_labelled(0.5)]

@@ -29,11 +29,11 @@ def main(part: str, minutes: float, seed: int, first: int, cases: int) -> None:
     begin, verdicts, kinds, largest = monotonic(), Counter[str](), Counter[str](), 0.0
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
         attempt = module.Attempt(Path(folder))
-        for number, case, outcome, used in run_cases(
+        for number, case, outcome, used_mb in run_cases(
             module.make_case, attempt, seed, range(first, first + cases), PARTS[part], begin + 60 * minutes
         ):
             verdicts[outcome.verdict] += 1
-            largest = max(largest, used)
+            largest = max(largest, used_mb)
             if outcome.verdict == FAILED:
                 kinds[classify_reason(outcome.reason)] += 1
                 if kinds[classify_reason(outcome.reason)] == 1:

@@ -66,10 +66,10 @@ def run_cases(
             outcome = Outcome(FAILED, f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})")
         finally:
             faulthandler.cancel_dump_traceback_later()
-        used = max(0.0, read_memory_mb("VmHWM") - before)
-        if used > max_mb and outcome.verdict != FAILED:
-            outcome = Outcome(FAILED, f"took {used:.0f} MB, more than {max_mb:g}")
-        yield number, case, outcome, used
+        used_mb = max(0.0, read_memory_mb("VmHWM") - before)
+        if used_mb > max_mb and outcome.verdict != FAILED:
+            outcome = Outcome(FAILED, f"took {used_mb:.0f} MB, more than {max_mb:g}")
+        yield number, case, outcome, used_mb
 
 
 def read_memory_mb(name: str, reset: bool = False) -> float:

@@ -66,8 +66,8 @@ def run_command(arguments: list[str], folder: Path, seconds: float, max_mb: floa
             return judge_command(None, "", "")
         sleep(0 if pid else 0.01)
     outcome = judge_command(os.waitstatus_to_exitcode(status), *(text.read_text(errors="replace") for text in texts))
-    if (used := usage.ru_maxrss / 1024) > max_mb:
-        return Outcome(FAILED, f"the command took {used:.0f} MB, more than {max_mb:g}")
+    if (used_mb := usage.ru_maxrss / 1024) > max_mb:
+        return Outcome(FAILED, f"the command took {used_mb:.0f} MB, more than {max_mb:g}")
     return outcome
 
 

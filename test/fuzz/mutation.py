@@ -119,8 +119,8 @@ def mutate_message(message: Any, rng: np.random.Generator) -> str:
         return f"{name} = {str(getattr(message, name))[:20]}"
     element = detail[0]
     if element[0] == Nodetype.BASE and element[1][0] != "string":
-        changed, what = _change_array(value, rng, fixed=node == Nodetype.ARRAY)
-        setattr(message, name, changed)
+        new_value, what = _change_array(value, rng, fixed=node == Nodetype.ARRAY)
+        setattr(message, name, new_value)
         return f"{name}: {what}"
     return f"{name}: {_change_list(message, name, element, rng)}"
 

@@ -31,17 +31,17 @@ class Attempt(Nodes):
         names = [name for name in list_parameter_names(fed.node) if not name.startswith(NOT_OURS)]
         before = [fed.node.get_parameter(pick(rng, names)) for _ in range(pick(rng, (1, 1, 1, 2)))]
         changes = [Parameter(p.name, value=make_hostile_value(p.value, rng, find_limits(fed, p.name))) for p in before]
-        shown = ", ".join(f"{p.name} = {str(p.value)[:40]!r}" for p in changes)
+        description = ", ".join(f"{p.name} = {str(p.value)[:40]!r}" for p in changes)
         result = fed.node.set_parameters_atomically(changes)
         if not result.successful:
-            return Outcome(REFUSED if result.reason else FAILED, f"{shown}: {result.reason}")
+            return Outcome(REFUSED if result.reason else FAILED, f"{description}: {result.reason}")
         states = fed.deliver_valid()
         outcome = fed.judge([s for s in states if BUG in s[1]] or states[:1])
         if not fed.node.set_parameters_atomically(before).successful:
-            return Outcome(FAILED, f"{shown}: the value before is refused")
+            return Outcome(FAILED, f"{description}: the value before is refused")
         if outcome.verdict != FAILED:
             outcome = fed.judge(fed.deliver_valid())
-        return Outcome(outcome.verdict, f"{shown}: {outcome.reason}")
+        return Outcome(outcome.verdict, f"{description}: {outcome.reason}")
 
 
 def find_limits(fed: FedNode, name: str) -> list[float]:

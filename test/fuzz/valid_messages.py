@@ -136,11 +136,11 @@ def _change_values(message: Any, rng: np.random.Generator) -> str:
     data = np.array(message.data)
     column = np.ndarray(count, dtype, data, field.offset, (message.point_step,))
     value = pick(rng, FLOATS if dtype.kind == "f" else INTEGERS)
-    chosen = rng.random(count) < pick(rng, (0.01, 0.3, 1.0))
+    rows = rng.random(count) < pick(rng, (0.01, 0.3, 1.0))
     with np.errstate(over="ignore"):
-        column[chosen] = np.array(value).astype(dtype) if dtype.kind == "f" else value & np.iinfo(dtype).max
+        column[rows] = np.array(value).astype(dtype) if dtype.kind == "f" else value & np.iinfo(dtype).max
     message.data = data
-    return f"{field.name} = {value} in {int(chosen.sum())} points"
+    return f"{field.name} = {value} in {int(rows.sum())} points"
 
 
 def _add_column(message: Any, rng: np.random.Generator) -> str:
@@ -161,9 +161,9 @@ def _add_column(message: Any, rng: np.random.Generator) -> str:
         values = np.where(rng.random(count) < 0.01, float(pick(rng, INTEGERS)), 0.0)
     with np.errstate(invalid="ignore", over="ignore"):
         column = values.astype(kind)
-    changed = add_columns(message, make_bag_message, **{name: column})
+    new_message = add_columns(message, make_bag_message, **{name: column})
     for field in ("fields", "point_step", "row_step", "data"):
-        setattr(message, field, getattr(changed, field))
+        setattr(message, field, getattr(new_message, field))
     return f"{name} as {kind}, {how}"
 
 

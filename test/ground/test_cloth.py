@@ -75,12 +75,12 @@ def make_climbing_road(seed=0):
     x, y = reach * np.cos(angle), reach * np.sin(angle)
     cars = np.array([[15.0, 3], [26, -3], [34, 4]])
     outside = np.abs(np.stack([x, y], axis=1)[:, None] - cars) > [2.1, 0.9]
-    seen = outside.any(axis=2).all(axis=1)
+    is_visible = outside.any(axis=2).all(axis=1)
 
     def rise(x):
         return 0.45 * (1 - np.cos(np.clip((x - 18) / 22, 0, 1) * np.pi))
 
-    road = np.column_stack([x, y, rise(x) - 1.73 + rng.normal(0, 0.01, len(x))])[seen]
+    road = np.column_stack([x, y, rise(x) - 1.73 + rng.normal(0, 0.01, len(x))])[is_visible]
     on_road = [rng.uniform(-1, 1, (300, 3)) * [2, 0.85, 0.55] + [*car, rise(car[0]) - 0.9] for car in cars]
     xyz = np.concatenate([road, *on_road])
     return xyz.astype(np.float32), np.arange(len(xyz)) < len(road)
@@ -106,11 +106,11 @@ def test_climbing_cells_equal_the_reference(seed, slope):
     lowest = rng.uniform(0, 0.8, (14, 18)).astype(np.float32)
     lowest[rng.random(lowest.shape) < 0.4] = UNOBSERVED
     height = np.zeros_like(lowest)
-    seen = np.argwhere(lowest != UNOBSERVED)
-    touched = {(r, c) for r, c in seen if lowest[r, c] <= 0.1}
+    observed_cells = np.argwhere(lowest != UNOBSERVED)
+    touched = {(r, c) for r, c in observed_cells if lowest[r, c] <= 0.1}
     while True:
         new = set()
-        for r, c in map(tuple, seen):
+        for r, c in map(tuple, observed_cells):
             near = sorted(((r - i) ** 2 + (c - j) ** 2, lowest[i, j]) for i, j in touched)
             if (
                 (r, c) not in touched
@@ -164,8 +164,8 @@ def test_rotating_about_z_rotates_the_ground(degrees, same):
     xyz, _ = make_street(3, slope=(0.05, 0.02))
     angle = np.radians(degrees)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    turned = (xyz @ turn.T).astype(np.float32)
-    assert (segment_by_cloth(turned) == segment_by_cloth(xyz)).mean() > same
+    rotated_xyz = (xyz @ turn.T).astype(np.float32)
+    assert (segment_by_cloth(rotated_xyz) == segment_by_cloth(xyz)).mean() > same
 
 
 @pytest.mark.parametrize("far", [[1e5, 0, 0], [0, -9e4, 50], [0, 101, -1.7], [95, 80, 30], [-99, 3, -8]])

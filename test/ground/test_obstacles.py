@@ -73,9 +73,9 @@ def test_tilted_sensor_gives_the_same_obstacles():
     xyz, ground = make_cloud(rng, 2000), rng.random(2000) < 0.5
     tilted = SensorPoseParams(roll=0.2, pitch=-0.3)
     axes = level_points(np.eye(3, dtype=np.float32), tilted)  # rows: the levelled axes
-    seen = (xyz.astype(float) @ np.linalg.inv(axes.astype(float))).astype(np.float32)
+    tilted_xyz = (xyz.astype(float) @ np.linalg.inv(axes.astype(float))).astype(np.float32)
     band = ObstacleParams(0.3, 4.0)
-    same = find_obstacles(seen, ground, band, tilted) == find_obstacles(xyz, ground, band)
+    same = find_obstacles(tilted_xyz, ground, band, tilted) == find_obstacles(xyz, ground, band)
     assert same.mean() > 0.998  # rounding moves some points into the next cell
 
 

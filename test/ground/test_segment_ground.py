@@ -62,10 +62,10 @@ def test_unusable_points_do_not_affect_the_others(method):
     rng = np.random.default_rng(0)
     bad = np.float32([[np.nan] * 3, [np.inf, 0, 0], [0, 0, 0], [2e5, 0, -1], [1, np.nan, -2]])
     at = np.sort(rng.integers(0, len(xyz), 500))
-    mixed = np.insert(xyz, at, bad[rng.integers(0, 5, 500)], axis=0)
+    all_points = np.insert(xyz, at, bad[rng.integers(0, 5, 500)], axis=0)
     is_bad = np.insert(np.zeros(len(xyz), bool), at, True)
-    intensity = rng.random(len(mixed)).astype(np.float32)
-    result = segment_xyz(mixed, method, intensity)
+    intensity = rng.random(len(all_points)).astype(np.float32)
+    result = segment_xyz(all_points, method, intensity)
     assert not result[is_bad].any()
     np.testing.assert_array_equal(result[~is_bad], segment_xyz(xyz, method, intensity[~is_bad]))
 

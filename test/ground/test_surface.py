@@ -20,8 +20,8 @@ def test_surface_of_a_plane_is_the_plane(seed, along, across):
     places = np.concatenate([rng.uniform(-25, 25, (10, 2)), [[5, 5]]])
     heights = fit_ground_surface(ground[holes], 0.0).height_at(places)
     np.testing.assert_allclose(heights, places @ [along, across] - 1.7, atol=0.05)
-    mixed = rng.permutation(ground[holes])
-    np.testing.assert_allclose(fit_ground_surface(mixed, 0.0).height_at(places), heights, atol=1e-9)
+    ground_points = rng.permutation(ground[holes])
+    np.testing.assert_allclose(fit_ground_surface(ground_points, 0.0).height_at(places), heights, atol=1e-9)
 
 
 @given(SEEDS, st.floats(-300, 300), st.floats(-300, 300))

@@ -263,9 +263,9 @@ def test_full_disk_leaves_no_partial_labels(format, tmp_path, limit_file_size):
 
 def test_data_set_is_written_completely_or_not_at_all(tmp_path, limit_file_size):
     frames = make_format_drive("one")
-    broken = replace(frames[2], load=lambda: (_ for _ in ()).throw(InputError("scan 2 is cut")))
+    broken_frame = replace(frames[2], load=lambda: (_ for _ in ()).throw(InputError("scan 2 is cut")))
     with pytest.raises(InputError, match="scan 2 is cut"):
-        write_dataset("kitti", [*frames[:2], broken], tmp_path / "out")
+        write_dataset("kitti", [*frames[:2], broken_frame], tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
     limit_file_size(600)
     with pytest.raises(InputError, match=r"cannot write .*out/training/velodyne/000000\.bin"):

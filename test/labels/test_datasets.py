@@ -263,12 +263,12 @@ def test_boxes_are_transformed_to_the_frame_of_the_clouds(parts, tmp_path):
         assert not results.read_recorded_results(poses, list_stamps()).sources
         return
     labels = bag_format.read(tmp_path / "bag", frames, "/n/output/detections")
-    shown = results.read_recorded_results(poses, list_stamps())
+    recorded_results = results.read_recorded_results(poses, list_stamps())
     for i, (frame, each) in enumerate(zip(frames, labels.frames)):
         near = transform_boxes(boxes, invert_pose(compute_base_pose(frame.stamp_ns) @ ON_BASE))
         np.testing.assert_allclose(each.boxes, near, atol=1e-3)
-        np.testing.assert_allclose(shown.sources["n"].detect(i, frame).boxes, near, atol=1e-3)
-        np.testing.assert_allclose(shown.tracks[0]["boxes"][i][1:8], near[0], atol=1e-3)
+        np.testing.assert_allclose(recorded_results.sources["n"].detect(i, frame).boxes, near, atol=1e-3)
+        np.testing.assert_allclose(recorded_results.tracks[0]["boxes"][i][1:8], near[0], atol=1e-3)
 
 
 def test_scans_with_equal_stamps_are_kept(tmp_path):

@@ -53,8 +53,8 @@ def keys(rows):
 def are_equal_boxes(a, b) -> bool:
     """Return True for equal boxes, up to rounding of the yaw, with pi equal to -pi."""
     a, b = (np.reshape(x, (-1, 7)) for x in (a, b))
-    turned = np.abs((a[:, 6] - b[:, 6] + np.pi) % (2 * np.pi) - np.pi)
-    return np.array_equal(a[:, :6], b[:, :6]) and bool((turned < 1e-12).all())
+    yaw_difference = np.abs((a[:, 6] - b[:, 6] + np.pi) % (2 * np.pi) - np.pi)
+    return np.array_equal(a[:, :6], b[:, :6]) and bool((yaw_difference < 1e-12).all())
 
 
 @each_make

@@ -143,21 +143,21 @@ def test_video_has_every_picture_with_its_duration(name, tmp_path):
             video.add(picture, 0.1 if k else 0.3)
         assert not path.exists()
     assert [p.name for p in path.parent.iterdir()] == [name]
-    seen, times = read_video(path)
-    assert [np.abs(image - 40 * k).max() <= 8 for k, image in enumerate(seen)] == [True] * 4
+    pictures, times = read_video(path)
+    assert [np.abs(image - 40 * k).max() <= 8 for k, image in enumerate(pictures)] == [True] * 4
     assert times == pytest.approx([0, 0.3, 0.4, 0.5], abs=0.011)
 
 
 def read_video(path):
     """Return the pictures and their start times in seconds."""
     if path.suffix in (".gif", ".webp"):
-        image, seen, times, now = Image.open(path), [], [], 0.0
+        image, pictures, times, now = Image.open(path), [], [], 0.0
         for k in range(image.n_frames):
             image.seek(k)
-            seen.append(np.asarray(image.convert("RGB"), float))
+            pictures.append(np.asarray(image.convert("RGB"), float))
             times.append(now)
             now += image.info["duration"] / 1000
-        return seen, times
+        return pictures, times
     import av
 
     with av.open(str(path)) as container:

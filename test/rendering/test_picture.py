@@ -52,13 +52,13 @@ def test_labels_trails_and_arrows_are_drawn(render_settings):
     labelled = count_pixels(draw_frame(render_settings, EMPTY, Boxes(), BOX), LABEL, 40)
     plain = count_pixels(draw_frame(render_settings, EMPTY, Boxes()), LABEL, 40)
     assert all(np.subtract(labelled, plain) > 10)
-    still = Boxes(BOX, np.array([CAR]))
+    static_boxes = Boxes(BOX, np.array([CAR]))
     trail = BOX[0, :3] - np.linspace(6, 0, 20)[:, None] * [0.0, 1.0, 0.0]
     for moving in (
         Boxes(BOX, np.array([CAR]), trails=[trail]),
         Boxes(BOX, np.array([CAR]), velocities=np.array([[0.0, 4.0]])),
     ):
-        assert np.any(draw_frame(render_settings, EMPTY, moving) != draw_frame(render_settings, EMPTY, still))
+        assert np.any(draw_frame(render_settings, EMPTY, moving) != draw_frame(render_settings, EMPTY, static_boxes))
 
 
 @each_range
@@ -68,9 +68,9 @@ def test_order_of_points_and_boxes_does_not_matter(render_settings, seed):
     rng, scan = np.random.default_rng(seed), make_cloud(seed, 300)
     scan.xyz[:, 2] += np.linspace(0, 1, 300)  # all depths differ
     boxes = np.vstack([BOX, BOX + [9, 8, 0, 0, 0, 0, 1]])
-    order, turned = rng.permutation(len(scan)), slice(None, None, -1)
+    order, reverse = rng.permutation(len(scan)), slice(None, None, -1)
     one = draw_frame(render_settings, scan, Boxes(boxes, np.array([CAR, PEDESTRIAN])))
-    two = draw_frame(render_settings, scan.take(order), Boxes(boxes[turned], np.array([PEDESTRIAN, CAR])))
+    two = draw_frame(render_settings, scan.take(order), Boxes(boxes[reverse], np.array([PEDESTRIAN, CAR])))
     assert np.mean(np.any(one != two, axis=2)) < 2e-3  # except points within one depth step
 
 

@@ -54,10 +54,10 @@ def test_boxes_and_candidates_keep_the_ids_of_the_cloud(processes, peer, drive_b
     assert candidates.ids.tolist() == [*range(len(candidates))]
     np.testing.assert_array_equal(np.float32(candidates.boxes), expected.final.boxes)
 
-    marked, shown = out[-1], from_marker_array(boxes[-1])
-    xyz = to_point_cloud(marked)[0].xyz
-    ids = read_column(marked, "cluster_id", np.arange(len(xyz)))
-    assert set(ids) - {0} == set(shown.ids) == {text["id"] for text in shown.extras}
-    for number, box in zip(shown.ids, shown.boxes, strict=True):
+    marked_cloud, marker_boxes = out[-1], from_marker_array(boxes[-1])
+    xyz = to_point_cloud(marked_cloud)[0].xyz
+    ids = read_column(marked_cloud, "cluster_id", np.arange(len(xyz)))
+    assert set(ids) - {0} == set(marker_boxes.ids) == {text["id"] for text in marker_boxes.extras}
+    for number, box in zip(marker_boxes.ids, marker_boxes.boxes, strict=True):
         inside = np.abs(xyz[ids == number][:, :2] - box[:2]) <= box[3:5] / 2 + 1e-3
         assert inside.all(), number

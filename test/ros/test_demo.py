@@ -104,8 +104,8 @@ def test_parameters_reach_the_nodes(drive_bag, tmp_path, monkeypatch, arguments,
 def test_demo_shows_no_latency_without_measurements(capsys):
     content = {"results": 1, "slower": 1.0, "memory_mb": 600.0, "stage_ms": {"tracker": 5.0}}
     _print_pace(content | {"latency_ms": {"median": 0.0, "p95": 0.0}, "cpu_ms_by_process": {"graph": -0.1}}, 1.0, 40)
-    shown = " ".join(capsys.readouterr().out.split())
-    assert "1 results; latency not measured" in shown and " 0 ms" not in shown and "CPU" not in shown
+    output = " ".join(capsys.readouterr().out.split())
+    assert "1 results; latency not measured" in output and " 0 ms" not in output and "CPU" not in output
 
 
 def test_demo_keeps_files_that_it_did_not_create(drive_bag, make_bag, tmp_path):

@@ -40,20 +40,20 @@ def test_cloud_of_moving_sensor_is_compensated(start_node, source):
     is used uncompensated, with a warning."""
     rng = np.random.default_rng(0)
     sensor = mount_pose(1.2, 0.1, 1.8, 0.5, 0.0, 0.0)
-    still = np.vstack(
+    static_xyz = np.vstack(
         [
             rng.uniform(-30, 30, (3000, 3)) * [1, 1, 0.001] - [0, 0, 1.8],
             rng.uniform(-0.5, 0.5, (50, 3)) + [-1.0, 0, -0.6],
         ]
     ).astype(np.float32)
     body = np.arange(3000, 3050)
-    seconds = rng.uniform(0.0, 0.1, len(still))
+    seconds = rng.uniform(0.0, 0.1, len(static_xyz))
 
     def poses(at):
         return np.array([compute_base_pose(START + round(s * 1e9)) @ sensor for s in at])
 
-    raw = skew(still, seconds, poses)
-    raw[body] = still[body]
+    raw = skew(static_xyz, seconds, poses)
+    raw[body] = static_xyz[body]
     node = start_node(
         GroundSegmentation,
         **{"input.deskew": source, "base_frame": "base", "crop.body": [-1.5, -1.5, 0.2, 2.0, 1.5, 2.5]},
@@ -77,11 +77,11 @@ def test_cloud_of_moving_sensor_is_compensated(start_node, source):
     assert "deskew" not in list_problems(node) and node.diagnostics.counts["deskewed"] == 1
     after = decode(node.sent["points"][-1], "sensor_msgs/msg/PointCloud2")
     compensated_xyz = np.column_stack([to_array(after)[n] for n in "xyz"])
-    others = np.setdiff1d(np.arange(len(still)), body)
-    wrong = np.linalg.norm(raw - still, axis=1)[others]
-    np.testing.assert_allclose(compensated_xyz[others], still[others], atol=5e-3)
+    others = np.setdiff1d(np.arange(len(static_xyz)), body)
+    wrong = np.linalg.norm(raw - static_xyz, axis=1)[others]
+    np.testing.assert_allclose(compensated_xyz[others], static_xyz[others], atol=5e-3)
     assert np.median(wrong) > 0.5
-    np.testing.assert_array_equal(compensated_xyz[body], still[body])
+    np.testing.assert_array_equal(compensated_xyz[body], static_xyz[body])
     assert not read_column(after, "in_view", body).any() and not to_array(after)["t"].any()
     frame_, _ = to_point_cloud(after)
     second_node = start_node(GroundSegmentation, **{"input.deskew": source})

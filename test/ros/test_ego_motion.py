@@ -52,12 +52,12 @@ def drive_and_compare(node, tell, poses, frame_id="lidar"):
     for i, (found, at) in enumerate(zip(make_crowd_detections(frames=len(poses)), poses)):
         stamp = START + i * TENTH
         tell(i, stamp)
-        seen = Detections.of(transform_boxes(found.boxes, invert_pose(at)), found.class_ids, found.scores)
-        node.on_markers(make_detection_markers(seen, make_cloud_header(stamp, frame_id), make_bag_message))
-        tracks, shown = library(seen, stamp, at), read_tracks(node)
-        assert shown.ids.tolist() == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]
-        np.testing.assert_allclose(shown.boxes, tracks.detections.boxes, atol=1e-4)
-        np.testing.assert_allclose([extra["velocity"] for extra in shown.extras], tracks.velocities, atol=2e-3)
+        sensor_detections = Detections.of(transform_boxes(found.boxes, invert_pose(at)), found.class_ids, found.scores)
+        node.on_markers(make_detection_markers(sensor_detections, make_cloud_header(stamp, frame_id), make_bag_message))
+        tracks, published = library(sensor_detections, stamp, at), read_tracks(node)
+        assert published.ids.tolist() == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]
+        np.testing.assert_allclose(published.boxes, tracks.detections.boxes, atol=1e-4)
+        np.testing.assert_allclose([extra["velocity"] for extra in published.extras], tracks.velocities, atol=2e-3)
 
 
 @pytest.mark.parametrize("source", ["odometry", "tf", "auto"])

@@ -119,8 +119,8 @@ def test_recorder_completes_its_bag(number, processes, peer, tmp_path):
     )
     process.send_signal(number)
     assert process.wait(timeout=60) == 0
-    with Bag(bag) as recorded:
-        assert recorded.counts["/note"] > 1
+    with Bag(bag) as reader:
+        assert reader.counts["/note"] > 1
     assert [path.name for path in tmp_path.glob("bag*")] == ["bag"]
 
 

@@ -56,18 +56,18 @@ def test_launch_file_starts_its_graph_or_single_detectors(name, load_launch_file
     nodes = load_launch_file(name)
     detectors = FILES[name].split(",")
     config = str(ROOT / "config" / f"{'fused' if name == 'detectors' else name}.param.yaml")
-    started = nodes(points="/cloud", use_sim_time="true", log_level="debug", reliability="reliable")
-    assert list(started) == list(build_graph(detectors))
+    node_by_name = nodes(points="/cloud", use_sim_time="true", log_level="debug", reliability="reliable")
+    assert list(node_by_name) == list(build_graph(detectors))
     assert list(nodes(single="true")) == list(build_graph(detectors, single=True))
-    assert ("~/input/points", "/cloud") in started["ground_segmentation"].remappings
-    assert ("~/input/points", "ground_segmentation/output/points") in (started["clustering"].remappings)
-    for node in started.values():
+    assert ("~/input/points", "/cloud") in node_by_name["ground_segmentation"].remappings
+    assert ("~/input/points", "ground_segmentation/output/points") in (node_by_name["clustering"].remappings)
+    for node in node_by_name.values():
         assert Path(node.parameters[0]).is_file() and node.namespace is None
         assert node.parameters[1] == {"use_sim_time": True, "input.reliability": "reliable"}
         assert node.ros_arguments == ["--log-level", "debug"]
         if not node.name.endswith("_detector"):
             assert node.parameters[0] == config
-    assert not any(node.respawn for node in started.values())
+    assert not any(node.respawn for node in node_by_name.values())
     restarted = nodes(respawn="true", rviz="true", tracking="true")
     assert all(node.respawn == (kind != "rviz2") for kind, node in restarted.items())
     for node in nodes(autostart="false").values():
@@ -100,25 +100,25 @@ def test_graph_is_one_process_if_requested_or_on_few_cores(processes, cores, tog
         log_level="debug",
         respawn="true",
     )
-    started = nodes(**arguments)
+    node_by_name = nodes(**arguments)
     graph = build_graph(["fused"], tracking=True)
-    assert len(started) == (1 if together else len(graph))
+    assert len(node_by_name) == (1 if together else len(graph))
     assert len(nodes(**arguments | {"tracking": "false"}, single="true")) == 1
     if not together:
         return
-    (node,) = started.values()
+    (node,) = node_by_name.values()
     assert (node.namespace, node.respawn, node.ros_arguments) == ("left", True, ["--log-level", "debug"])
     parts, shared = split_arguments([node.executable, *node.arguments, "--ros-args", "-r", "a:=b"])
     assert [part[0] for part in parts] == [*graph] and shared == ["--ros-args", "-r", "a:=b"]
     for part, name in zip(parts, graph):
-        alone = nodes(**arguments | {"processes": "true"})[name]
+        own_node = nodes(**arguments | {"processes": "true"})[name]
         options = list(zip(part[2::2], part[3::2]))
         assert [tuple(rule.split(":=")) for option, rule in options if option == "-r"] == [
             ("__node", name),
-            *alone.remappings,
+            *own_node.remappings,
         ]
         files = [file for option, file in options if option == "--params-file"]
-        for file, parameters in zip(files, alone.parameters, strict=True):
+        for file, parameters in zip(files, own_node.parameters, strict=True):
             assert read_sections(file) == (
                 read_sections(parameters) if isinstance(parameters, str) else {"/**": parameters}
             )
@@ -154,8 +154,8 @@ def test_expert_parameters_follow_from_the_detectors(detectors, given, expected,
 
 @pytest.mark.parametrize("detectors", ["pointnet,pointpillars", "pointpillars,pointnet"])
 def test_first_detector_sets_parameters_of_ground_and_clusters(detectors, load_launch_file):
-    started = load_launch_file("detectors")(detectors=detectors)
-    files = {name: Path(node.parameters[0]).name.split(".")[0] for name, node in started.items()}
+    node_by_name = load_launch_file("detectors")(detectors=detectors)
+    files = {name: Path(node.parameters[0]).name.split(".")[0] for name, node in node_by_name.items()}
     assert files["ground_segmentation"] == files["clustering"] == detectors.split(",")[0]
     assert all(files[f"{name}_detector"] == name for name in detectors.split(","))
 
@@ -170,15 +170,15 @@ def test_arguments_override_user_file_and_defaults(load_launch_file, tmp_path):
         "/**/fused_detector: {ros__parameters: {fused: {range: ahead}}}\n"
         "left: {clustering: {ros__parameters: {clustering.density: 1.0}}}\n"
     )
-    started = nodes(config=f"{ROOT}/config/best.param.yaml,{mine}", range="around")
-    *files, argument_values, argument_file = started["fused_detector"].parameters
+    node_by_name = nodes(config=f"{ROOT}/config/best.param.yaml,{mine}", range="around")
+    *files, argument_values, argument_file = node_by_name["fused_detector"].parameters
     assert [Path(file).name for file in files] == ["fused.param.yaml", "best.param.yaml", "mine.yaml"]
     assert (
         read_sections(argument_file)
         == {"/**/fused_detector": argument_values}
         == {"/**/fused_detector": {"fused.range": "around"}}
     )
-    assert started["clustering"].parameters[1:] == files[1:]
+    assert node_by_name["clustering"].parameters[1:] == files[1:]
     assert nodes.messages == []
 
 
@@ -243,21 +243,21 @@ def test_second_sensor_has_its_own_names(load_launch_file):
     for node in nodes(namespace="left").values():
         assert node.namespace == "left"
         assert not any(topic.startswith("/") for _, topic in node.remappings)
-    started = nodes(name_prefix="left_", detectors="pointnet")
-    assert [n.name for n in started.values()] == ["left_" + n for n in started]
-    assert started["clustering"].remappings == [
+    node_by_name = nodes(name_prefix="left_", detectors="pointnet")
+    assert [n.name for n in node_by_name.values()] == ["left_" + n for n in node_by_name]
+    assert node_by_name["clustering"].remappings == [
         ("~/input/points", "left_ground_segmentation/output/points"),
         ("~/input/odometry", "odom"),
     ]
-    assert ("~/input/points", "points") in started["ground_segmentation"].remappings
+    assert ("~/input/points", "points") in node_by_name["ground_segmentation"].remappings
 
 
 def test_tracking_adds_a_tracker_to_each_detector(load_launch_file):
     nodes = load_launch_file("detectors")
-    started = nodes(
+    node_by_name = nodes(
         tracking="true", odometry="/odometry", points="/cloud", namespace="left", name_prefix="a_", detectors=SEVERAL
     )
-    trackers = {name: node for name, node in started.items() if node.executable == "tracker"}
+    trackers = {name: node for name, node in node_by_name.items() if node.executable == "tracker"}
     assert list(trackers) == [f"a_{name}_tracker" for name in SEVERAL.split(",")]
     behind = trackers["a_pointnet_tracker"]
     found = "a_pointnet_detector/output/detections"
@@ -269,8 +269,8 @@ def test_tracking_adds_a_tracker_to_each_detector(load_launch_file):
     assert behind.namespace == "left"
     [file] = behind.parameters
     assert Path(file).name == "tracker.param.yaml" and Path(file).is_file()
-    alone = nodes(tracking="true", detectors="pointpillars")
-    assert ("~/input/detections", "pointpillars_detector/output/detections") in (alone["tracker"].remappings)
+    single_nodes = nodes(tracking="true", detectors="pointpillars")
+    assert ("~/input/detections", "pointpillars_detector/output/detections") in (single_nodes["tracker"].remappings)
     assert "tracker" not in nodes(detectors="pointpillars")
 
 
@@ -307,13 +307,13 @@ def test_weights_device_and_range_of_a_detector_are_arguments(name, load_launch_
         expected[f"{name}.range"] = "around"
     for file, weights in (name, "w.safetensors"), ("detectors", f"{name}=w.safetensors"):
         nodes = load_launch_file(file)
-        started = nodes(
+        node_by_name = nodes(
             weights=weights,
             device="cpu",
             range="around",
             detectors=name if file == name else "pointnet,pointpillars,fused",
         )
-        assert started[f"{name}_detector"].parameters[1] == expected
+        assert node_by_name[f"{name}_detector"].parameters[1] == expected
 
 
 @pytest.mark.parametrize("single", ["false", "true"])
@@ -321,11 +321,11 @@ def test_weights_device_and_range_of_a_detector_are_arguments(name, load_launch_
 def test_replay_connects_player_nodes_and_evaluator(detectors, single, load_launch_file, drive_bag):
     """Also if an including file has arguments of these names."""
     nodes = load_launch_file("replay")
-    started = nodes(bag=str(drive_bag), detectors=detectors, single=single, scores="scores.json", processes="true")
+    node_by_name = nodes(bag=str(drive_bag), detectors=detectors, single=single, scores="scores.json", processes="true")
     names = detectors.split(",")
-    assert {*started} == {*build_graph(names, single == "true"), "bag_player", "evaluator"}
+    assert {*node_by_name} == {*build_graph(names, single == "true"), "bag_player", "evaluator"}
     found = {name: f"{find_result_node(name, single == 'true')}/output/detections" for name in names}
-    player, evaluator = started["bag_player"].parameters[-1], started["evaluator"].parameters[-1]
+    player, evaluator = node_by_name["bag_player"].parameters[-1], node_by_name["evaluator"].parameters[-1]
     assert player["follow"] == [*found.values()]
     assert {f"{topic}:=2" for topic in found.values()} < {*player["wait_for"]}  # evaluator, player
     by_paper = names == ["candidates"]
@@ -333,11 +333,11 @@ def test_replay_connects_player_nodes_and_evaluator(detectors, single, load_laun
         ["stage1", "stage2", "final"] if by_paper else ["final"] if len(names) == 1 else names
     )
     assert evaluator.get("classes") == (["Pedestrian"] if by_paper else None)
-    remapped = dict(started["evaluator"].remappings)
+    remapped = dict(node_by_name["evaluator"].remappings)
     assert set(found.values()) < {*remapped.values()}
     assert ("~/input/camera_info" in remapped) != by_paper
     for node in build_graph(names, single == "true"):
-        files = [Path(f).name for f in started[node].parameters if isinstance(f, str)]
+        files = [Path(f).name for f in node_by_name[node].parameters if isinstance(f, str)]
         assert "replay.param.yaml" in files
         assert ("replay_candidates.param.yaml" in files) == ("candidates" in names)
 

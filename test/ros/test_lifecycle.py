@@ -206,19 +206,19 @@ def test_simulated_clock_works_after_cleanup(make_local_node, peer):
 def test_node_waits_for_missing_network_file(nodes, peer, late_weights, weights):
     """Configuring fails until the file exists. A node with autostart then loads it by itself."""
     reason = f"checkpoint not found: {late_weights}"
-    driven, alone = f"waits/{NODE}", f"tries/{NODE}"
+    managed_node, autostarted_node = f"waits/{NODE}", f"tries/{NODE}"
     for _ in range(2):
-        assert not change_state(peer, driven, "configure")
-        assert get_state(peer, driven) == State.PRIMARY_STATE_UNCONFIGURED
-    for node in (driven, alone):
+        assert not change_state(peer, managed_node, "configure")
+        assert get_state(peer, managed_node) == State.PRIMARY_STATE_UNCONFIGURED
+    for node in (managed_node, autostarted_node):
         peer.wait_for_diagnostics(node, reason, level=2)
         peer.wait(lambda n=node: peer.get_value(n, "lifecycle") == "unconfigured", "the state")
         assert "ready" not in nodes.read_log(node.replace("/", "."))
     part = late_weights.with_name("part")
     part.write_bytes(weights.read_bytes())
     part.rename(late_weights)
-    change_states(peer, driven, "configure", "activate")
-    for node in (driven, alone):
+    change_states(peer, managed_node, "configure", "activate")
+    for node in (managed_node, autostarted_node):
         talker = peer.advertise(f"/{node}/input/points", CLOUD)
         found = peer.listen(f"/{node}/output/detections", MARKERS)
         peer.send(talker, make_scan_message(1), lambda f=found: find_received(f, 1), "detections")
@@ -239,8 +239,8 @@ def test_failed_activation_is_reported_and_retried(make_local_node, peer, monkey
     def refuse(reception):
         raise RuntimeError("no such policy")
 
-    with monkeypatch.context() as broken:
-        broken.setattr(Reception, "open", refuse)
+    with monkeypatch.context() as patch:
+        patch.setattr(Reception, "open", refuse)
         node = make_local_node(GroundSegmentation, {}, {"~/input/points": "/in"})
         assert (node.get_state_label(), node.diagnostics.state[0]) == ("inactive", ERROR)
         assert "not active: RuntimeError: no such policy" in node.diagnostics.state[1]

@@ -94,9 +94,9 @@ def test_frames_have_the_published_columns_and_boxes(view, received, shared_peer
 
     def compared():
         for frame in view.json("api/drive")["frames"][-20:]:  # older ones are dropped soon
-            shown = view.json(f"api/labels/{frame['frame']}")
-            rows = shown["detections"].get("perception")
-            if rows and shown["labels"]:
+            objects = view.json(f"api/labels/{frame['frame']}")
+            rows = objects["detections"].get("perception")
+            if rows and objects["labels"]:
                 body = view.bytes(f"api/cloud/{frame['frame']}")
                 count = int(np.frombuffer(body, np.uint32, 1, 4)[0])
                 ground = np.frombuffer(body, np.uint8, count, 8 + 13 * count)
@@ -111,13 +111,13 @@ def test_frames_have_the_published_columns_and_boxes(view, received, shared_peer
 
     found: list = []
     shared_peer.wait(compared, "a frame with columns, detections and labels")
-    shown, stamp_ns, ground, clusters = found
+    boxes, stamp_ns, ground, clusters = found
 
     def as_published():  # the page may receive it before this listener
         expected = [np.column_stack([d.boxes, d.scores]) for d in published(stamp_ns)]
-        return any(shown.shape == e.shape and np.allclose(shown, e, atol=1e-6) for e in expected)
+        return any(boxes.shape == e.shape and np.allclose(boxes, e, atol=1e-6) for e in expected)
 
-    shared_peer.wait(as_published, f"detections as shown, {shown}")
+    shared_peer.wait(as_published, f"detections as shown, {boxes}")
     assert 0.2 < ground.mean() < 1 and clusters.max() >= 1 and not clusters[ground == 1].any()
     shared_peer.wait(
         lambda: any(len(t["boxes"]) > 1 and t["trails"] for t in view.json("api/state")["tracks"]),

@@ -87,8 +87,8 @@ def test_parameters_are_those_of_the_dataclass(perception, shared_peer):
             ("clustering.dbscan.eps", [0.1], "range_limits"),
             ("seed.source", "dream", "ground_truth, click, file"),
         ]:
-            (refused,) = peer.set_parameters("/perception", {name: value})
-            assert refused and words in refused
+            (reason,) = peer.set_parameters("/perception", {name: value})
+            assert reason and words in reason
 
 
 @pytest.mark.parametrize("kind", [GroundSegmentation, Perception])

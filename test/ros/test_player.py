@@ -302,14 +302,14 @@ BAD = {
 @pytest.fixture(scope="module")
 def failed_players(shared_processes, text_bag, drive_bag, tmp_path_factory):
     """Start one player per case in its own namespace; return the players and the truncated bag."""
-    cut = tmp_path_factory.mktemp("cut") / "texts"
-    shutil.copytree(text_bag, cut)
-    storage = next(cut.glob("*.mcap"))
+    truncated_bag = tmp_path_factory.mktemp("cut") / "texts"
+    shutil.copytree(text_bag, truncated_bag)
+    storage = next(truncated_bag.glob("*.mcap"))
     storage.write_bytes(storage.read_bytes()[:-300])
     for case, (bad, _) in BAD.items():
-        bag = {"truncated": cut, "types": drive_bag}.get(case, text_bag)
+        bag = {"truncated": truncated_bag, "types": drive_bag}.get(case, text_bag)
         shared_processes.start("bag_player", {}, {"bag": str(bag), **bad}, namespace=case)
-    return cut
+    return truncated_bag
 
 
 @pytest.mark.parametrize("case", BAD)

@@ -189,8 +189,8 @@ def test_every_cloud_is_processed_or_counted_as_dropped():
             sizes.append(steps[0] - 1)
         first = sizes[0]  # the number before the first is unknown
         assert arrivals.sent == number - first == taken + arrivals.dropped + arrivals.lost
-        sent, lost, dropped = arrivals.count_recent()
-        assert 0 <= lost + dropped < sent and sent >= WINDOW
+        sent_count, lost_count, dropped_count = arrivals.count_recent()
+        assert 0 <= lost_count + dropped_count < sent_count and sent_count >= WINDOW
         assert arrivals.expected_rate == arrivals.measure_rate() == pytest.approx(10)
 
 
@@ -246,9 +246,9 @@ def test_incompatible_publisher_is_reported_with_remedy(start_node, monkeypatch,
         ]
         monkeypatch.setattr(reception, "list_publishers", lambda there=there: there)
         reception.adapt()
-        asked = reception.subscription.qos_profile.reliability
+        requested = reception.subscription.qos_profile.reliability
         texts = [text for kind, _, text in reception.problems() if kind == "incompatible"]
-        assert bool(texts) == (asked == RELIABLE and BEST_EFFORT in offered)
+        assert bool(texts) == (requested == RELIABLE and BEST_EFFORT in offered)
         assert all(text.startswith("/best_effort on /") and remedy in text for text in texts)
         assert bool(texts) == (remedy != "" and BEST_EFFORT in offered)
 

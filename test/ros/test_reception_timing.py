@@ -62,8 +62,8 @@ class SimulatedReception:
             _parameter_overrides={},
             create_guard_condition=lambda work: SimpleNamespace(trigger=lambda: self.todo.append(work)),
         )
-        self.todo, asked = [], ReceptionParams(**params)
-        self.reception = Reception(node, None, "points", self.deliver, lambda: asked)
+        self.todo, reception_params = [], ReceptionParams(**params)
+        self.reception = Reception(node, None, "points", self.deliver, lambda: reception_params)
         handle = MagicMock()
         handle.take_message.return_value = None
         self.reception.subscription = MagicMock(handle=handle)
@@ -107,12 +107,12 @@ def test_slow_sensor_is_not_reported_as_silent(monkeypatch, given, learned, erro
         (1.1 + stale, ["stale"]),
     ):
         assert [kind for kind, _, _ in simulated.reception.problems()] == kinds
-    for wanted, stay in ((0, 0), (2, lifetime), (9, 9)):
+    for setting, seconds in ((0, 0), (2, lifetime), (9, 9)):
         node = SimpleNamespace(
             inputs=SimpleNamespace(receptions=[simulated.reception]),
-            node_params=SimpleNamespace(output=MarkerParams(marker_lifetime=wanted)),
+            node_params=SimpleNamespace(output=MarkerParams(marker_lifetime=setting)),
         )
-        assert find_marker_lifetime_ns(node) == stay * 10**9
+        assert find_marker_lifetime_ns(node) == seconds * 10**9
 
 
 @pytest.mark.parametrize("lag, rate", [(0.0, 10), (0.05, 10), (0.13, 10), (0.25, 4), (0.6, 1.6)])

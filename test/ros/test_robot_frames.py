@@ -119,7 +119,7 @@ def test_detections_of_tilted_and_level_sensor_are_equal(start_node, weights):
     scan = make_scan()
     place = mount_pose(0.7, -0.3, 1.73, 0.2, 0.0, 0.0)
     tilt = make_tilted_pose(-0.2, 0.3)
-    seen = transform_points(scan.xyz.astype(np.float64), invert_pose(tilt))
+    tilted_xyz = transform_points(scan.xyz.astype(np.float64), invert_pose(tilt))
     level = start_node(PointPillarsNode, target_frame="base", **weights)
     level.transforms.on_tf(transforms(("base", "lidar", place, 0)), static=True)
     deliver_cloud(level, make_robot_cloud(scan.xyz, intensity=scan.intensity))
@@ -128,7 +128,7 @@ def test_detections_of_tilted_and_level_sensor_are_equal(start_node, weights):
     for values, name in (({"target_frame": "base"}, "base"), ({}, "lidar")):
         node = start_node(PointPillarsNode, base_frame="base", **values, **weights)
         node.transforms.on_tf(transforms(("base", "lidar", place @ tilt, 0)), static=True)
-        deliver_cloud(node, make_robot_cloud(seen, intensity=scan.intensity))
+        deliver_cloud(node, make_robot_cloud(tilted_xyz, intensity=scan.intensity))
         detections, frame_id, _ = read_detections(node)
         assert frame_id == name and len(detections) == len(expected)
         boxes = detections.boxes.astype(np.float64)
@@ -137,15 +137,15 @@ def test_detections_of_tilted_and_level_sensor_are_equal(start_node, weights):
             by_hand = start_node(
                 PointPillarsNode, **{**weights, "ground.sensor_pose.roll": -0.2, "ground.sensor_pose.pitch": 0.3}
             )
-            deliver_cloud(by_hand, make_robot_cloud(seen, intensity=scan.intensity))
+            deliver_cloud(by_hand, make_robot_cloud(tilted_xyz, intensity=scan.intensity))
             hand, _, _ = read_detections(by_hand)
             assert len(hand) == len(detections)
             np.testing.assert_allclose(np.sort(hand.boxes, axis=0), np.sort(detections.boxes, axis=0), atol=2e-2)
         order, other = (np.lexsort(b[:, 1::-1].round(1).T) for b in (boxes, expected.boxes))
         np.testing.assert_allclose(boxes[order][:, :6], expected.boxes[other][:, :6], atol=2e-2)
         if name == "base":
-            turned = boxes[order][:, 6] - expected.boxes[other][:, 6]
-            np.testing.assert_allclose(np.sin(turned), 0, atol=1e-2)
+            yaw_difference = boxes[order][:, 6] - expected.boxes[other][:, 6]
+            np.testing.assert_allclose(np.sin(yaw_difference), 0, atol=1e-2)
 
 
 @pytest.mark.parametrize("by", ["hand", "TF", "nothing"])
@@ -158,7 +158,7 @@ def test_ahead_parameter_rotates_the_range_of_the_detectors(start_node, weights,
     expected, _, _ = read_detections(plain)
     tilt = np.eye(4) if by == "nothing" else make_tilted_pose(-0.2, 0.3)
     level = invert_pose(mount_pose(0, 0, 0, np.radians(ahead), 0, 0)) @ tilt
-    seen = transform_points(scan.xyz.astype(np.float64), invert_pose(level))
+    rotated_xyz = transform_points(scan.xyz.astype(np.float64), invert_pose(level))
     leans = {
         "hand": {"ground.sensor_pose.roll": -0.2, "ground.sensor_pose.pitch": 0.3},
         "TF": {"base_frame": "base"},
@@ -168,7 +168,7 @@ def test_ahead_parameter_rotates_the_range_of_the_detectors(start_node, weights,
     if by == "TF":
         place = mount_pose(0.7, -0.3, 1.73, 1.0, 0.0, 0.0)  # its heading in the base has no effect
         node.transforms.on_tf(transforms(("base", "lidar", place @ tilt, 0)), static=True)
-    deliver_cloud(node, make_robot_cloud(seen, intensity=scan.intensity))
+    deliver_cloud(node, make_robot_cloud(rotated_xyz, intensity=scan.intensity))
     found, frame_id, _ = read_detections(node)
     assert frame_id == "lidar" and len(found) == len(expected) > 5
     assert node.diagnostics.counts["cropped"] == plain.diagnostics.counts["cropped"]
@@ -177,8 +177,8 @@ def test_ahead_parameter_rotates_the_range_of_the_detectors(start_node, weights,
     order, other = (np.lexsort(b[:, 1::-1].round(1).T) for b in (back, expected.boxes))
     np.testing.assert_allclose(back[order][:, :6], expected.boxes[other][:, :6], atol=2e-2)
     if by == "nothing":
-        turned = back[order][:, 6] - expected.boxes[other][:, 6] - np.radians(ahead)
-        np.testing.assert_allclose(np.sin(turned), 0, atol=1e-2)
+        yaw_difference = back[order][:, 6] - expected.boxes[other][:, 6] - np.radians(ahead)
+        np.testing.assert_allclose(np.sin(yaw_difference), 0, atol=1e-2)
 
 
 def test_click_and_candidates_in_rotated_cloud(start_node):
@@ -234,15 +234,15 @@ def test_body_crop_needs_a_known_frame(start_node):
     node = start_node(GroundSegmentation, base_frame="base", **{"crop.body": [-0.5, -0.4, 0.2, 0.5, 0.4, 1.0]})
     floor = np.random.default_rng(0).uniform(-20, 20, (2000, 3)) * [1, 1, 0]
     sensor = mount_pose(0.5, 0.0, 1.2, 0.0, 0.0, 0.0)  # the base's origin is behind it
-    seen = transform_points(np.vstack([floor, [[0.3, 0.0, 0.8]], [[0.9, 0.0, 0.8]]]), invert_pose(sensor))
-    deliver_cloud(node, make_robot_cloud(seen))
+    sensor_xyz = transform_points(np.vstack([floor, [[0.3, 0.0, 0.8]], [[0.9, 0.0, 0.8]]]), invert_pose(sensor))
+    deliver_cloud(node, make_robot_cloud(sensor_xyz))
     assert not node.diagnostics.counts["cropped"] and "crop.body is not applied" in list_problems(node)
     node.transforms.on_tf(transforms(("base", "lidar", sensor, START)), static=True)
-    deliver_cloud(node, make_robot_cloud(seen, START + 1))
+    deliver_cloud(node, make_robot_cloud(sensor_xyz, START + 1))
     assert node.diagnostics.counts["cropped"] == 1 and "crop.body" not in list_problems(node)
     low = start_node(GroundSegmentation, base_frame="base", **{"crop.body": [-0.5, -0.4, -1.0, 0.5, 0.4, -0.2]})
     low.transforms.on_tf(transforms(("base", "lidar", sensor, START)), static=True)
-    deliver_cloud(low, make_robot_cloud(seen))
+    deliver_cloud(low, make_robot_cloud(sensor_xyz))
     assert "the top of crop.body is 0.20 m below 'base'" in list_problems(low)
 
 
@@ -291,9 +291,9 @@ def test_tracks_of_tilted_sensor_are_in_the_cloud_frame(start_node, weights):
         **{**weights, "base_frame": "base", "target_frame": "base", "tracking.enabled": True, "tracking.report": 0.0},
     )
     node.transforms.on_tf(transforms(("base", "lidar", tilt, 0)), static=True)
-    seen = transform_points(scan.xyz.astype(np.float64), make_tilted_pose(-0.2, 0.3).T)
+    tilted_xyz = transform_points(scan.xyz.astype(np.float64), make_tilted_pose(-0.2, 0.3).T)
     for i in range(4):
-        deliver_cloud(node, make_robot_cloud(seen, START + i * PERIOD, scan.intensity))
+        deliver_cloud(node, make_robot_cloud(tilted_xyz, START + i * PERIOD, scan.intensity))
     (found, base, _), (tracks, cloud, _) = read_detections(node), read_detections(node, "tracks")
     assert (base, cloud) == ("base", "lidar") and len(found) and len(tracks)
     centres = transform_points(tracks.boxes[:, :3].astype(np.float64), tilt)

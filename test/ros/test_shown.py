@@ -95,14 +95,16 @@ def load_rviz_manager():
 def test_every_topic_of_the_rviz_file_is_in_the_graph(graph_topics):
     types, offered = graph_topics
     manager = load_rviz_manager()
-    shown = [d for d in manager["Displays"] + manager["Tools"] if "Topic" in d]
-    assert {"clustering/output/points", "clicked_point"} < {d["Topic"]["Value"] for d in shown}
-    for display in shown:
+    displays = [d for d in manager["Displays"] + manager["Tools"] if "Topic" in d]
+    assert {"clustering/output/points", "clicked_point"} < {d["Topic"]["Value"] for d in displays}
+    for display in displays:
         topic, policy = f"/{display['Topic']['Value']}", display["Topic"]["Reliability Policy"]
         assert types[topic] == RVIZ[display["Class"]], topic
-        wanted = QoSProfile(depth=5, reliability=ReliabilityPolicy.get_from_short_key(policy.lower().replace(" ", "_")))
+        requested_qos = QoSProfile(
+            depth=5, reliability=ReliabilityPolicy.get_from_short_key(policy.lower().replace(" ", "_"))
+        )
         if topic in offered:
-            assert compatible(offered[topic], wanted)[0] != QoSCompatibility.ERROR, topic
+            assert compatible(offered[topic], requested_qos)[0] != QoSCompatibility.ERROR, topic
 
 
 def test_every_topic_of_the_foxglove_layout_is_in_the_graph(graph_topics):
@@ -171,9 +173,9 @@ def test_costmap_gets_the_obstacles_of_each_cloud(processes, peer, drive_bag):
     peer.send(talker, cloud, lambda: all(messages.values()), "obstacles of both")
     frame, indices = to_point_cloud(cloud)
     ground = segment_ground(frame)
-    chosen = find_obstacles(frame.xyz, ground, ObstacleParams(0.2, 2.5))
-    assert 0 < chosen.sum() < (~ground).sum()
-    sent = to_array(cloud)[indices[chosen]]
+    obstacles = find_obstacles(frame.xyz, ground, ObstacleParams(0.2, 2.5))
+    assert 0 < obstacles.sum() < (~ground).sum()
+    sent = to_array(cloud)[indices[obstacles]]
     for message, *_ in messages.values():
         assert [(f.name, f.datatype) for f in message.fields] == [(name, 7) for name in ("x", "y", "z", "intensity")]
         assert message.header == cloud.header

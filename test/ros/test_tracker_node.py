@@ -131,15 +131,15 @@ def assert_tracked(frames, messages, poses, params):
     """Assert that messages equal the library's tracks of `frames`, MarkerArrays of detections. Return the Tracks
     of each frame, None if there was no message.
     """
-    tracker, shown, messages = Tracker(params), [], iter(messages)
+    tracker, published, messages = Tracker(params), [], iter(messages)
     for frame in map(from_marker_array, frames):
         tracks = tracker(to_detections(frame), frame.stamp_ns, poses.get(frame.stamp_ns))
-        shown.append(tracks if tracker.frame_used else None)
+        published.append(tracks if tracker.frame_used else None)
         if tracker.frame_used and (message := next(messages, None)) is not None:
             assert read_tracks(message)[0] == frame.stamp_ns
             assert message.markers[0].header.frame_id == "velodyne"
             assert_same(message, tracks)
-    return shown
+    return published
 
 
 def test_graph_tracks_equal_library_tracks_and_end_on_loop(looped_messages, drive_bag):
@@ -147,9 +147,9 @@ def test_graph_tracks_equal_library_tracks_and_end_on_loop(looped_messages, driv
     poses = read_poses(drive_bag)
     stamps = [from_marker_array(m).stamp_ns for m in messages["found"]]
     assert len(poses) == clouds and stamps[: 2 * clouds] == 2 * sorted(poses)
-    shown = assert_tracked(messages["found"], messages["behind"], poses, TrackingParams())
+    published = assert_tracked(messages["found"], messages["behind"], poses, TrackingParams())
     rounds = [
-        {i for t in shown[start : start + clouds] if t is not None for i in t.ids.tolist()} for start in (0, clouds)
+        {i for t in published[start : start + clouds] if t is not None for i in t.ids.tolist()} for start in (0, clouds)
     ]
     assert rounds[0] and rounds[1] and not rounds[0] & rounds[1]
     assert int(diagnostics["ended"]) > 0 and int(diagnostics["born"]) > 0
@@ -170,8 +170,8 @@ def test_ids_follow_the_people_of_the_drive(looped_messages, drive_bag):
 def test_tracker_inside_the_detector_equals_the_library(looped_messages, drive_bag):
     """Each cloud waits for its pose, like the frames of a tracker node."""
     _, messages, _ = looped_messages
-    shown = assert_tracked(messages["found"], messages["inside"], read_poses(drive_bag), TrackingParams())
-    assert any(t is not None and len(t) for t in shown)
+    published = assert_tracked(messages["found"], messages["inside"], read_poses(drive_bag), TrackingParams())
+    assert any(t is not None and len(t) for t in published)
 
 
 def test_bad_frames_and_poses_are_reported(processes, peer):
@@ -185,9 +185,9 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
 
     def send(message, words="tracking", answered=True):
         """Publish once; wait for the expected tracks, if any, and for the reason in the diagnostics."""
-        shown = len(tracks)
+        count = len(tracks)
         talker.publish(encode(message))
-        peer.wait(lambda: words in peer.get_message(NODE) and len(tracks) >= shown + answered, f"'{words}'")
+        peer.wait(lambda: words in peer.get_message(NODE) and len(tracks) >= count + answered, f"'{words}'")
         return tracks[-1]
 
     def frame(found, frame_id="lidar"):
@@ -259,6 +259,6 @@ def test_detection_arrays_are_tracked_like_markers(start_node):
             )
         )
         tracks = tracker(found, stamp, np.eye(4))
-        shown = read_tracks(decode(node.sent["tracks"][-1], MARKERS))
-        assert shown[1] == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]
-        np.testing.assert_allclose(shown[2].boxes, tracks.detections.boxes, atol=1e-4)
+        published = read_tracks(decode(node.sent["tracks"][-1], MARKERS))
+        assert published[1] == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]
+        np.testing.assert_allclose(published[2].boxes, tracks.detections.boxes, atol=1e-4)

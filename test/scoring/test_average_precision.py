@@ -20,12 +20,12 @@ seeds = st.integers(0, 2**32 - 1)
 def test_thresholds_are_scores_at_evenly_spaced_recall(seed, objects):
     rng = np.random.default_rng(seed)
     hits = rng.uniform(0, 1, rng.integers(1, objects + 1))
-    chosen = choose_thresholds(hits, objects)
-    assert len(chosen) <= 41 and (np.diff(chosen) < 0).all() and np.isin(chosen, hits).all()
-    recall = np.array([(hits >= t).sum() for t in chosen]) / objects
+    thresholds = choose_thresholds(hits, objects)
+    assert len(thresholds) <= 41 and (np.diff(thresholds) < 0).all() and np.isin(thresholds, hits).all()
+    recall = np.array([(hits >= t).sum() for t in thresholds]) / objects
     # Each threshold is within half a step of its recall; the last hit covers the remaining points.
-    np.testing.assert_allclose(recall[:-1], np.arange(len(chosen) - 1) / 40, atol=1 / objects + 1e-9)
-    assert chosen[-1] == hits.min()
+    np.testing.assert_allclose(recall[:-1], np.arange(len(thresholds) - 1) / 40, atol=1 / objects + 1e-9)
+    assert thresholds[-1] == hits.min()
 
 
 @pytest.mark.parametrize("objects", [1, 2, 7, 40, 41, 1000])

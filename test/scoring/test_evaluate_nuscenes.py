@@ -80,8 +80,8 @@ def test_checkpoint_and_its_result_file_score_equally(root, detector, tmp_path, 
     direct, text = evaluate(
         tmp_path, "--data", root, "--weights", "w.safetensors", "--device", "cpu", "--write-results", out
     )
-    ((path, *asked),) = detector.asked
-    assert (str(path), *asked) == ("w.safetensors", "cpu", MIN_SCORE, folder.SENSOR[2])
+    ((path, *settings),) = detector.asked
+    assert (str(path), *settings) == ("w.safetensors", "cpu", MIN_SCORE, folder.SENSOR[2])
     assert direct["frames"] == 8 and direct["ms"] >= 0 and direct["version"] == "v1.0-mini"
     car, person = (direct["classes"][n] for n in ("car", "pedestrian"))
     assert car["mean_ap"] > 99 and car["ate"] < 0.3 and person["mean_ap"] > 99
@@ -130,9 +130,9 @@ def test_only_the_best_boxes_of_a_frame_are_written(root):
     scores = rng.uniform(0, 1, MAX_BOXES + 50)
     results = to_results(Detections.of(np.ones((len(scores), 7)), 0, scores), frame)
     assert len(results) == MAX_BOXES and results.scores.min() > np.sort(scores)[49]
-    broken = Detections.of(np.full((1, 7), np.nan), 0)
+    nan_detections = Detections.of(np.full((1, 7), np.nan), 0)
     with pytest.raises(InputError, match=r"scene-0103/00: a box or score .* not finite"):
-        to_results(broken, frame)
+        to_results(nan_detections, frame)
 
 
 def test_unreadable_and_rejected_scans_are_reported(root, detector, tmp_path):

@@ -52,8 +52,8 @@ def match_by_brute_force(found, truth, limit):
     if len(found) > len(truth):
         return match_by_brute_force(truth, found, limit)
     best = (0, 0.0)
-    for chosen in permutations(range(len(truth)), len(found)):
-        d = [np.linalg.norm(found[i, :3] - truth[j, :3]) for i, j in enumerate(chosen)]
+    for assignment in permutations(range(len(truth)), len(found)):
+        d = [np.linalg.norm(found[i, :3] - truth[j, :3]) for i, j in enumerate(assignment)]
         d = [x for x in d if x <= limit]
         best = min(best, (-len(d), sum(d)))
     return -best[0], best[1]
@@ -235,11 +235,11 @@ def test_empty_recording_has_an_empty_report():
 
 
 def test_only_pedestrians_count():
-    mixed = GroundTruth.of(
+    truth = GroundTruth.of(
         make_boxes([1, 0, 0], [2, 0, 0], [3, 0, 0]),
         [PEDESTRIAN, CLASSES.index("Person_sitting"), CLASSES.index("Cyclist")],
     )
-    np.testing.assert_array_equal(select_pedestrians(mixed), make_boxes([1, 0, 0]))
+    np.testing.assert_array_equal(select_pedestrians(truth), make_boxes([1, 0, 0]))
     assert select_pedestrians(None).shape == (0, 7)
 
 

@@ -29,8 +29,8 @@ def test_blocks_partition_the_frames_of_each_drive(lengths, named):
 
 @given(st.integers(1, 45))
 def test_bag_with_frames_named_by_time_is_one_drive(count):
-    times, named = [f"{10**9 * i}" for i in range(count)], [f"0000/{i}" for i in range(count)]
-    assert [*map(list, group_frames(times, sequential=True))] == [*map(list, group_frames(named))]
+    times, sequence_names = [f"{10**9 * i}" for i in range(count)], [f"0000/{i}" for i in range(count)]
+    assert [*map(list, group_frames(times, sequential=True))] == [*map(list, group_frames(sequence_names))]
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 40))

@@ -64,8 +64,8 @@ def test_results_do_not_depend_on_number_of_processes(root):
     assert one == two and kinds == [type(result) for _, result in two]
     assert kinds == [tuple, SkipReason, tuple, type(None), tuple]
     assert [i for i, _ in one] == [*range(COUNT)]
-    chosen = [1, 2, 4]
-    assert [*measure_frames(recording, start_counting, chosen)] == [one[i] for i in chosen]
+    selection = [1, 2, 4]
+    assert [*measure_frames(recording, start_counting, selection)] == [one[i] for i in selection]
     assert [*measure_frames(recording, start_counting, [], jobs=3)] == []
 
 

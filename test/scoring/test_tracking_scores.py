@@ -132,7 +132,7 @@ def test_order_of_frames_does_not_matter():
 def test_unnamed_drives_of_a_bag_score_like_named_ones():
     """Track ids are counted separately in each drive."""
 
-    def content(named):
+    def content(with_names):
         frames, found = [], {}
         for k in range(2):
             for i, (truth, _) in enumerate(make_drive()):
@@ -140,7 +140,9 @@ def test_unnamed_drives_of_a_bag_score_like_named_ones():
                 truth = GroundTruth.of(truth.boxes[:: 1 - 2 * k], truth.class_ids, truth.extras)
                 found[scan.stamp_ns] = DetectionResult(Detections.of(truth.boxes, CAR, 0.9))
                 frames.append(
-                    Frame.of(f"{k}/{i}", scan, truth, sequence=str(k) * named, index=i if named else len(frames))
+                    Frame.of(
+                        f"{k}/{i}", scan, truth, sequence=str(k) * with_names, index=i if with_names else len(frames)
+                    )
                 )
         recording, report = Recording("a", "", frames), TrackingReport()
         fill_report(
@@ -183,10 +185,10 @@ def test_frames_without_pose_are_counted_and_reported(capsys):
 def test_neighbour_classes_and_truncated_labels_are_ignored():
     vans = make_drive(kind=VAN)
     assert score_drive(vans) is None
-    cut = [
+    truncated_frames = [
         (GroundTruth.of(t.boxes, t.class_ids, [{**e, "truncated": 2.0} for e in t.extras]), k) for t, k in make_drive()
     ]
-    assert score_drive(cut) is None
+    assert score_drive(truncated_frames) is None
     behind = [
         (
             GroundTruth.of(t.boxes - [60.0, 0, 0, 0, 0, 0, 0], t.class_ids, t.extras),

@@ -76,22 +76,22 @@ def test_horizontal_slice_of_a_wall_is_not_taken_for_ground():
     rng = np.random.default_rng(0)
     ground = rng.uniform([-25, -25, 1.71], [25, 25, 1.75], (20000, 3))
     wall = rng.uniform([4, -3, -0.28], [9, 3, -0.24], (150, 3))
-    seen = [SimpleNamespace(xyz=np.concatenate(parts).astype(np.float32)) for parts in ([ground, wall],) * 3]
-    assert find_ground_plane(seen[0].xyz, True) is not None
-    mount = measure_mount(seen)
+    scans = [SimpleNamespace(xyz=np.concatenate(parts).astype(np.float32)) for parts in ([ground, wall],) * 3]
+    assert find_ground_plane(scans[0].xyz, True) is not None
+    mount = measure_mount(scans)
     assert mount.upside_down and mount.height == pytest.approx(1.73, abs=0.01)
-    indoors = [SimpleNamespace(xyz=(s.xyz * [1, 1, -1]).astype(np.float32)) for s in seen]
+    indoors = [SimpleNamespace(xyz=(s.xyz * [1, 1, -1]).astype(np.float32)) for s in scans]
     ceiling = rng.uniform([-25, -25, 2.2], [25, 25, 2.24], (20000, 3))
     indoors = [SimpleNamespace(xyz=np.concatenate([s.xyz, ceiling]).astype(np.float32)) for s in indoors]
     assert not measure_mount(indoors).upside_down
 
 
 def test_known_model_gets_all_beams_from_a_partial_view(tmp_path):
-    seen = tuple(
+    partial_scans = tuple(
         s._make(column[s.ring > 1] if isinstance(column, np.ndarray) else column for column in s)
         for s in simulate_scans("vlp-16")
     )
-    m = measure_sensor(seen, [0, 1, 10, 11], "part", 12, None)
+    m = measure_sensor(partial_scans, [0, 1, 10, 11], "part", 12, None)
     (tmp_path / "sensor.yaml").write_text(format_sensor(m))
     assert len(m.pattern.beams.elevations) == 14
     assert "14 of the 16 beams" in " ".join(find_warnings(m))
@@ -104,8 +104,8 @@ def test_model_is_recognised_by_its_beams(name):
     up = np.degrees(sensor.elevations)
     beams = Beams(up, 0 * up, 0 * up, 0 * up, [], "ring")
     number = np.arange(len(up))
-    for seen in up, up[number % 7 != 3], up + 0.05 * (-1) ** number:
-        assert find_matching_model(beams._replace(elevations=seen)) == ("" if sensor.wander else name)
+    for elevations in up, up[number % 7 != 3], up + 0.05 * (-1) ** number:
+        assert find_matching_model(beams._replace(elevations=elevations)) == ("" if sensor.wander else name)
     for half, rows in ((12.5, 126), (11.25, 112), (12.5, 60)):
         assert not find_matching_model(beams._replace(elevations=np.linspace(half, -half, rows)))
 
@@ -130,13 +130,13 @@ def test_beams_from_rings_and_from_elevations_agree():
 def test_scan_lines_of_non_repeating_pattern_are_not_beams():
     """The four scan lines of a Livox sweep the entire view; here all returns are from a ceiling."""
     rng = np.random.default_rng(0)
-    changed = []
+    changed_scans = []
     for scan in simulate_scans("vlp-16"):
         away, aside = rng.uniform(2, 12, len(scan.xyz)), np.radians(scan.azimuth)
         xyz = np.column_stack(
             [away * np.cos(aside), away * np.sin(aside), 2 - 0.02 * away + rng.normal(0, 0.01, len(away))]
         )
-        changed.append(
+        changed_scans.append(
             scan._replace(
                 xyz=xyz,
                 ground_range=away,
@@ -144,7 +144,7 @@ def test_scan_lines_of_non_repeating_pattern_are_not_beams():
                 elevation=np.degrees(np.arctan2(xyz[:, 2], away)),
             )
         )
-    assert find_beams(changed) is None
+    assert find_beams(changed_scans) is None
 
 
 def test_sparse_sensor_gets_wider_neighbourhoods():

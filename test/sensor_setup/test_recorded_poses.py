@@ -117,8 +117,8 @@ def test_heading_error_is_at_least_7_degrees_from_one_place():
 
 
 def test_shifts_need_poses_and_straight_motion():
-    turned = make_mount(10) @ invert_pose(make_mount(0))
-    poses = {0: np.eye(4), 1: np.eye(4), 2: turned}
+    rotated_pose = make_mount(10) @ invert_pose(make_mount(0))
+    poses = {0: np.eye(4), 1: np.eye(4), 2: rotated_pose}
     steps = compute_shifts(poses, dict.fromkeys([(0, 1), (0, 2), (0, 7)]))
     assert steps == {(0, 1): (0, 0), (0, 2): None}
 
@@ -133,8 +133,8 @@ def test_contradiction_between_tf_and_clouds_is_reported():
     row = next(value for value in list_values(right) if value.name == "mount by TF")
     assert row.confidence == "high"
     assert not any("URDF" in line for line in find_warnings(right))
-    recorded = right.mounting.recorded._replace(problem="3 of 4 clouds have no pose")
-    unposed = replace(right, mounting=right.mounting._replace(recorded=recorded))
+    incomplete_poses = right.mounting.recorded._replace(problem="3 of 4 clouds have no pose")
+    unposed = replace(right, mounting=right.mounting._replace(recorded=incomplete_poses))
     assert any("only from clouds: 3 of 4 clouds" in line for line in find_warnings(unposed))
     for tf_mount, height, words in (
         (make_mount(0, roll + 3, pitch), None, "has roll"),

@@ -88,8 +88,8 @@ def test_simulate_accepts_measured_sensor(setup_folder, tmp_path):
 
 def test_bad_input_leaves_no_file(tmp_path, bag):
     (tmp_path / "one.pcd").write_text("no cloud")
-    for data, named in ((tmp_path / "none", "does not exist"), (tmp_path / "one.pcd", "not a readable PCD file")):
-        with pytest.raises(InputError, match=named):
+    for data, words in ((tmp_path / "none", "does not exist"), (tmp_path / "one.pcd", "not a readable PCD file")):
+        with pytest.raises(InputError, match=words):
             run("--data", data, "--out", tmp_path / "robot")
     with pytest.raises(InputError, match="no topic"):
         run("--data", bag, "--topic", "/other", "--out", tmp_path / "robot")

@@ -72,9 +72,9 @@ def has_warning(m, *parts):
 def test_motion_of_robot_is_recognised():
     scans = change_scans(None)
     one, drives = measure(scans[:1]), measure(scans)
-    still = measure(scans[:1] * 5, (0, 1, 2, 3, 4))
+    stationary = measure(scans[:1] * 5, (0, 1, 2, 3, 4))
     assert has_warning(one, "only one cloud", "record") and one.view.coverage.stationary is None
-    assert has_warning(still, "stands still", "record") and still.view.coverage.stationary
+    assert has_warning(stationary, "stands still", "record") and stationary.view.coverage.stationary
     assert not has_warning(drives, "stands still") and not has_warning(drives, "only one cloud")
 
 
@@ -108,10 +108,8 @@ def test_robot_body_is_found_and_cropped():
     own = xyz[np.hypot(*xyz[:, :2].T) < 1.0]
     by_tf = m.mounting.recorded._replace(footprint=make_tilted_pose(0.1, -0.2, 0.9))
     by_ground = make_tilted_pose(mount.roll, mount.pitch, mount.height)
-    for recorded, base in ((m.mounting.recorded, by_ground), (by_tf, by_tf.footprint)):
-        (line,) = re.findall(
-            r"# body: (.*)", format_params(replace(m, mounting=m.mounting._replace(recorded=recorded)))
-        )
+    for poses, base in ((m.mounting.recorded, by_ground), (by_tf, by_tf.footprint)):
+        (line,) = re.findall(r"# body: (.*)", format_params(replace(m, mounting=m.mounting._replace(recorded=poses))))
         assert select_points(own, CropParams(body=tuple(json.loads(line))), base).mean() < 0.02
 
 
@@ -256,11 +254,11 @@ def test_upside_down_sensor_is_described_as_mounted(beams):
         measure(change_scans(lambda p, axes=axes: make_rotation(np.diag(axes))(select_part(p))))
         for axes in ([1, 1, 1], [1, -1, -1])
     )
-    level, turned = make_sensor(own), make_sensor(other)
-    np.testing.assert_allclose(turned.elevations, level.elevations, atol=np.radians(0.1))
-    np.testing.assert_allclose(turned.blocked, level.blocked, atol=1.01)
-    assert turned.wander == pytest.approx(level.wander, rel=0.05)
-    assert bool(turned.wander) != beams
+    level_sensor, inverted_sensor = make_sensor(own), make_sensor(other)
+    np.testing.assert_allclose(inverted_sensor.elevations, level_sensor.elevations, atol=np.radians(0.1))
+    np.testing.assert_allclose(inverted_sensor.blocked, level_sensor.blocked, atol=1.01)
+    assert inverted_sensor.wander == pytest.approx(level_sensor.wander, rel=0.05)
+    assert bool(inverted_sensor.wander) != beams
     if beams:  # beams are denser at the height of people
         up = np.array([14.0, 11, 8, 5, 3, 1, -6, -8, -10, -12, -14])
         assert replace_elevations(own, up).elevation_step == 2
@@ -332,20 +330,20 @@ def test_unusable_clouds_are_rejected():
         points["x"], points["y"] = points["x"] + 300, points["y"] - 300
         return points
 
-    for change, named in (
+    for change, words in (
         (in_millimetres, "millimetres"),
         (in_map_frame, "frame such as map"),
         (lambda p: p[:50], "50 usable points"),
     ):
-        with pytest.raises(InputError, match=named) as error:
+        with pytest.raises(InputError, match=words) as error:
             read_scan(change_cloud(simulate_messages()[0], change))
         assert "\n" not in str(error.value)
     with pytest.raises(InputError, match="2D scanner"):
         measure(change_scans(lambda p: p[p["ring"] == 8]))
-    mixed = change_scans(None)
+    scans = change_scans(None)
     with pytest.raises(InputError, match="different columns"):
-        measure([mixed[0]._replace(columns=("x", "y", "z")), *mixed[1:]])
-    m = measure(mixed)
+        measure([scans[0]._replace(columns=("x", "y", "z")), *scans[1:]])
+    m = measure(scans)
     high = replace(m, mounting=m.mounting._replace(mount=m.mounting.mount._replace(height=60.0)))
     with pytest.raises(InputError, match=r"height = 60\.0 is outside 0\.0 \.\. 50\.0 m; use"):
         format_params(high)

@@ -107,8 +107,8 @@ def test_joint_cast_gives_the_nearest_of_single_casts(motion):
     nearest = cast_rays(objects.take(np.arange(0)), ground, OVER_ROAD, SENSOR, motion)._asdict()
     for i in range(count):
         # The other solids are out of reach, so that solid i keeps its index.
-        alone = replace(objects, centre=np.where(np.arange(count)[:, None] == i, objects.centre, 1e4))
-        is_hit = cast_rays(alone, Ground(), NO_GROUND, SENSOR, motion)
+        single_solid = replace(objects, centre=np.where(np.arange(count)[:, None] == i, objects.centre, 1e4))
+        is_hit = cast_rays(single_solid, Ground(), NO_GROUND, SENSOR, motion)
         nearer = is_hit.range < nearest["range"]
         assert (is_hit.solid[nearer] == i).all()
         for name in nearest.keys() - {"unoccluded_counts"}:
@@ -127,8 +127,8 @@ def test_wall_is_flat_only_after_motion_compensation():
     )
     assert len(flat.xyz) > 1000 and np.abs(flat.xyz[:, 0] - 9).max() < 1e-5
     assert np.ptp(raw.xyz[:, 0]) > 0.1
-    still = cast_rays(wall, Ground(), NO_GROUND, exact)
-    returns = make_returns(still, exact, NO_MOTION, np.random.default_rng(0), False)
+    static_hits = cast_rays(wall, Ground(), NO_GROUND, exact)
+    returns = make_returns(static_hits, exact, NO_MOTION, np.random.default_rng(0), False)
     assert np.ptp(returns.xyz[:, 0]) < 1e-5
 
 

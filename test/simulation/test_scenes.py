@@ -153,11 +153,11 @@ def test_robot_scenes_have_labels_all_around_and_no_camera(tmp_path):
 
 
 def test_mixture_alternates_between_kinds_of_scenes():
-    mixed = Scenes(None, 1.0, "street,indoor")
-    assert make_cached_scene("indoor", None, 3).kind == make_scene(3, None, 2.0, mixed.scene).kind
-    assert make_scene(4, None, 1.0, mixed.scene).kind == make_scene(4).kind
-    source = SimulatedScenes(3, 2, TINY, mixed)
-    assert not mixed.camera and source.load_frame(0).camera() is None
+    mixture = Scenes(None, 1.0, "street,indoor")
+    assert make_cached_scene("indoor", None, 3).kind == make_scene(3, None, 2.0, mixture.scene).kind
+    assert make_scene(4, None, 1.0, mixture.scene).kind == make_scene(4).kind
+    source = SimulatedScenes(3, 2, TINY, mixture)
+    assert not mixture.camera and source.load_frame(0).camera() is None
     assert source.load_scene(0).height == 0.6 and source.cache_key(0) != SimulatedScenes(3, 2, TINY).cache_key(0)
 
 

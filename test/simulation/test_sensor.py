@@ -176,14 +176,14 @@ def test_beam_wander_is_uniformly_distributed():
 
 def test_rays_rotate_and_move_with_the_sensor():
     motion = Motion((3.0, -2.0, 0.5), 0.7, stamp=0.25)
-    still, turn = make_rays(SMALL), make_rays(SMALL, motion)
-    assert np.allclose(turn.times, SMALL.compute_firing_times() - 0.025)
-    assert np.allclose(turn.origin[:, 0], turn.times[:, None] * motion.velocity)
-    bearing = np.arctan2(turn.direction[..., 1], turn.direction[..., 0])
-    before = np.arctan2(still.direction[..., 1], still.direction[..., 0])
-    turned = (bearing - before - 0.7 * turn.times[:, None] + np.pi) % (2 * np.pi) - np.pi
-    assert np.allclose(turned, 0)
-    assert np.allclose(turn.direction[..., 2], still.direction[..., 2])
+    static_rays, moving_rays = make_rays(SMALL), make_rays(SMALL, motion)
+    assert np.allclose(moving_rays.times, SMALL.compute_firing_times() - 0.025)
+    assert np.allclose(moving_rays.origin[:, 0], moving_rays.times[:, None] * motion.velocity)
+    bearing = np.arctan2(moving_rays.direction[..., 1], moving_rays.direction[..., 0])
+    before = np.arctan2(static_rays.direction[..., 1], static_rays.direction[..., 0])
+    angle_error = (bearing - before - 0.7 * moving_rays.times[:, None] + np.pi) % (2 * np.pi) - np.pi
+    assert np.allclose(angle_error, 0)
+    assert np.allclose(moving_rays.direction[..., 2], static_rays.direction[..., 2])
 
 
 def test_returns_have_documented_properties():
@@ -248,8 +248,8 @@ def test_far_and_dark_returns_are_lost():
     assert abs(fraction[100, 0.4] - 0.5) < 0.1  # power is proportional to brightness / range^2
     assert len(make_measurement(open_sensor, 5.0, 0.0).xyz) == 0 and not len(make_measurement(SMALL, np.inf).xyz)
     assert len(make_measurement(SMALL, 50.0, cosine=0.05).xyz) < len(make_measurement(SMALL, 50.0).xyz)
-    lost = 1 - len(make_measurement(replace(SMALL, dropout=0.2), 5.0).xyz) / SMALL.columns / SMALL.rings
-    assert abs(lost - 0.2) < 0.03
+    lost_fraction = 1 - len(make_measurement(replace(SMALL, dropout=0.2), 5.0).xyz) / SMALL.columns / SMALL.rings
+    assert abs(lost_fraction - 0.2) < 0.03
 
 
 def test_infinite_reach_keeps_every_hit():

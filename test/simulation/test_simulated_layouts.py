@@ -55,16 +55,16 @@ def test_columns_of_scan_agree_with_points():
 def test_object_layout_is_read_as_written(simulated_data_sets):
     recording = open_recording(simulated_data_sets / "kitti")
     assert len(recording) == 5
-    for number, recorded in enumerate(recording):
+    for number, frame_read in enumerate(recording):
         scan = simulate_scan(3 + number // 2, number % 2, TINY)
         order = np.argsort(scan.ring, kind="stable")
-        assert recorded.name == f"{number:06}"
-        frame, camera = recorded.load(), recorded.camera()
+        assert frame_read.name == f"{number:06}"
+        frame, camera = frame_read.load(), frame_read.camera()
         assert np.array_equal(frame.xyz, scan.frame.xyz[order])
         assert np.array_equal(frame.intensity, scan.frame.intensity[order])
         assert np.allclose(camera.projection, FORWARD_CAMERA.camera().projection)
         assert (camera.width, camera.height) == (1242, 375)
-        assert_same_objects(recorded.truth(), make_kitti_labels(scan.truth), 0.0051)
+        assert_same_objects(frame_read.truth(), make_kitti_labels(scan.truth), 0.0051)
 
 
 def test_hidden_objects_become_dont_care():
@@ -82,10 +82,10 @@ def test_hidden_objects_become_dont_care():
 def test_tracking_layout_is_read_as_written(simulated_data_sets):
     frames = open_recording(simulated_data_sets / "kitti-tracking").frames
     assert [f.name for f in frames] == ["0000/000000", "0000/000001", "0001/000000", "0001/000001", "0002/000000"]
-    for number, recorded in enumerate(open_recording(simulated_data_sets / "kitti-tracking")):
+    for number, frame_read in enumerate(open_recording(simulated_data_sets / "kitti-tracking")):
         scan = simulate_scan(3 + number // 2, number % 2, TINY)
         expected = make_kitti_labels(scan.truth)
-        truth = recorded.truth()
+        truth = frame_read.truth()
         assert_same_objects(truth, expected, 6e-7, truncation=0.26)
         assert [e["track_id"] for e in truth.extras] == [e["track_id"] for e in expected.extras]
 
@@ -97,8 +97,8 @@ def assert_same_objects(actual, expected, accuracy, truncation=None):
     for (_, a), (_, b) in zip(actual.notes, expected.notes):
         assert a["bbox"] == pytest.approx(b["bbox"], abs=accuracy)
     assert np.abs(actual.boxes - expected.boxes)[:, :6].max(initial=0) <= 1.6 * accuracy
-    turned = wrap_angle(actual.boxes[:, 6] - expected.boxes[:, 6])
-    assert np.abs(turned).max(initial=0) <= accuracy
+    yaw_difference = wrap_angle(actual.boxes[:, 6] - expected.boxes[:, 6])
+    assert np.abs(yaw_difference).max(initial=0) <= accuracy
     for a, b in zip(actual.extras, expected.extras):
         scale = 2 if truncation else 1  # the tracking layout has levels 0, 1 and 2
         assert abs(a["truncated"] / scale - b["truncated"]) <= (truncation or accuracy)
@@ -155,9 +155,9 @@ def test_bag_contains_consecutive_streets(tmp_path):
     result = run_simulate(tmp_path / "bag", "mcap", 4, 1, "--streets-of", 2)
     assert result.exit_code == 0, result.output
     recording = list(open_recording(tmp_path / "bag"))
-    for number, recorded in enumerate(recording):
+    for number, frame_read in enumerate(recording):
         scan = simulate_scan(3 + number // 2, number % 2, TINY)
-        assert np.array_equal(recorded.load().xyz, scan.frame.xyz)
+        assert np.array_equal(frame_read.load().xyz, scan.frame.xyz)
     stamps = [r.load().stamp_ns for r in recording]
     assert np.diff(stamps).tolist() == [10**8, 101 * 10**8, 10**8]
 

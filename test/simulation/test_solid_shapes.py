@@ -209,10 +209,10 @@ def test_faster_walkers_take_longer_steps():
 @pytest.mark.parametrize("carried", people.CARRIED[1:])
 def test_baggage_does_not_change_width_or_height_of_box(carried):
     plain = people.make_pedestrian(np.random.default_rng(2), 1.2)
-    loaded = people.make_pedestrian(np.random.default_rng(2), 1.2, carried=carried)
-    assert len(loaded.parts(0.0)) > len(plain.parts(0.0))
-    assert loaded.size[1:] == plain.size[1:]
-    low, _ = find_extents(loaded.parts(0.3))
+    pedestrian = people.make_pedestrian(np.random.default_rng(2), 1.2, carried=carried)
+    assert len(pedestrian.parts(0.0)) > len(plain.parts(0.0))
+    assert pedestrian.size[1:] == plain.size[1:]
+    low, _ = find_extents(pedestrian.parts(0.3))
     assert abs(low[2]) < 1e-9
 
 

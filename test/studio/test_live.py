@@ -153,14 +153,14 @@ def test_missing_tf_is_reported_and_invalid_boxes_left_out(live):
 def test_boxes_in_another_frame_are_transformed_once_tf_arrives(live, monkeypatch):
     live.expect_topic(TRACKED, TRACKS)
     second = 10**9
-    mounted, turned = [1.0, 0.5, 1.7], [0.0, 0.0, np.sin(0.2), np.cos(0.2)]  # by 0.4 rad
+    translation, rotation = [1.0, 0.5, 1.7], [0.0, 0.0, np.sin(0.2), np.cos(0.2)]  # by 0.4 rad
     trail = np.array([[5.0, 0.0, 0.0], [6.0, 0.0, 0.0]])
-    live.tree.set("base", "velodyne", 0, mounted, turned, static=True)
+    live.tree.set("base", "velodyne", 0, translation, rotation, static=True)
     live.tree.set("odom", "base", 10 * second, [0, 0, 0], [0, 0, 0, 1])
     live.add_boxes(FOUND, boxes(10 * second), None)
     for i, stamp in enumerate((10 * second, 10 * second + second // 2)):
         live.add_cloud(cloud(stamp))
-        pose = make_pose(np.array([4.0 * i / 2, 0, 0]), [0, 0, 0, 1]) @ make_pose(mounted, turned)
+        pose = make_pose(np.array([4.0 * i / 2, 0, 0]), [0, 0, 0, 1]) @ make_pose(translation, rotation)
         found = Detections.of(transform_boxes(boxes(stamp).boxes, pose), [0], [0.5])
         tracks = make_track_markers(
             np.array([3]),
@@ -266,9 +266,9 @@ def test_boxes_of_another_robot_are_not_selected():
         ("/points", True),
         ("/livox/lidar", True),
     ):
-        alone = {"/b" + FOUND: MARKERS}  # belongs to another robot, or is the only one
-        assert bool(select_box_topics(alone, clouds)) == theirs
-        assert not select_box_topics(alone | {"/c" + FOUND: MARKERS}, clouds)
+        other_boxes = {"/b" + FOUND: MARKERS}  # belongs to another robot, or is the only one
+        assert bool(select_box_topics(other_boxes, clouds)) == theirs
+        assert not select_box_topics(other_boxes | {"/c" + FOUND: MARKERS}, clouds)
     assert set(select_box_topics(one, "/ouster/points")) == {FOUND, TRACKED, TRUTH}
 
 

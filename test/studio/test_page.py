@@ -115,9 +115,9 @@ def test_body_moves_horizontally_and_rotates_about_its_centre(page, labels, pers
     centre = get_centre(page, "[data-view=top]")
     drag(page, (x, y), (centre[0] - x, centre[1] - 60 - y))  # from the right to the top: a quarter turn
     labels.wait(page, number, lambda t: get_boxes(t)[0] != moved_box)
-    turned = labels.box(number)
-    assert turned[:6] == pytest.approx(moved_box[:6], abs=1e-6)
-    assert wrap_angle(turned[6] - moved_box[6]) == pytest.approx(math.pi / 2, abs=0.1)
+    rotated_box = labels.box(number)
+    assert rotated_box[:6] == pytest.approx(moved_box[:6], abs=1e-6)
+    assert wrap_angle(rotated_box[6] - moved_box[6]) == pytest.approx(math.pi / 2, abs=0.1)
 
 
 def test_arrow_keys_move_along_the_box_as_one_action(page, labels, person):
@@ -159,14 +159,14 @@ def test_pressed_row_is_selected_even_if_the_list_changes(page, labels, person):
     labels.wait(page, other, lambda t: t is not None)
     page.click("[data-filter=all]")
     assert page.evaluate("page.store.selected") == number
-    for chosen in other, number:
-        row = page.locator(f"[data-track='{chosen}']").bounding_box()
+    for pressed_number in other, number:
+        row = page.locator(f"[data-track='{pressed_number}']").bounding_box()
         page.mouse.move(row["x"] + 30, row["y"] + row["height"] / 2)
         page.mouse.down()
         page.evaluate("document.getElementById('tracks').dispatchEvent(new Event('scroll'))")
         page.mouse.up()
-        page.wait_for_function("n => page.store.selected === n", arg=chosen)
-        page.wait_for_selector(f"[data-track='{chosen}'][aria-selected=true]")
+        page.wait_for_function("n => page.store.selected === n", arg=pressed_number)
+        page.wait_for_selector(f"[data-track='{pressed_number}'][aria-selected=true]")
 
 
 def test_small_drag_and_space_key_do_not_change_boxes(page, labels, person):
@@ -320,7 +320,7 @@ def test_killed_server_loses_no_saved_labels(page, browser, labels, person):
 
 
 def test_view_shows_labels_and_rejects_actions(browser, drive_bag):
-    with run_server("view", drive_bag, "--no-open") as shown, open_page(browser, shown.url) as page:
+    with run_server("view", drive_bag, "--no-open") as server, open_page(browser, server.url) as page:
         truth = next(iter(open_recording(drive_bag))).truth()
         assert page.evaluate("page.store.results.labels.length") == len(truth)
         assert page.locator("#accept").is_hidden() and page.locator("#export").is_hidden()
@@ -337,23 +337,23 @@ def test_view_steps_through_misses_by_key(browser, drive_bag, tmp_path):
     results = tmp_path / "nothing"  # no detections in any frame
     results.mkdir()
     with (
-        run_server("view", drive_bag, "--results", results, "--no-open") as shown,
-        open_page(browser, shown.url) as page,
+        run_server("view", drive_bag, "--results", results, "--no-open") as server,
+        open_page(browser, server.url) as page,
     ):
         missed = page.evaluate("page.store.results.matches.nothing.missed")
         counts = page.evaluate("[...document.querySelectorAll('#counts b')].map(b => Number(b.textContent))")
         assert counts[0] == sum(counts[1:4]) > counts[2] == len(missed) > 0
         assert counts[4] == sum(counts[5:]) == 0
-        seen = []
+        positions = []
         for k in [*missed, None]:
             page.keyboard.press("n")
             page.wait_for_function(
                 "([n, seen]) => page.store.selectedResult?.error === 'missed' && "
                 "page.store.selectedResult.frame * 1000 + page.store.selectedResult.k !== seen",
-                arg=[k, seen[-1] if seen else -1],
+                arg=[k, positions[-1] if positions else -1],
             )
-            seen.append(page.evaluate("page.store.selectedResult.frame * 1000 + page.store.selectedResult.k"))
-        assert seen[:-1] == missed and seen[-1] >= 1000  # the last one is in the next frame
+            positions.append(page.evaluate("page.store.selectedResult.frame * 1000 + page.store.selectedResult.k"))
+        assert positions[:-1] == missed and positions[-1] >= 1000  # the last one is in the next frame
         assert page.inner_text("#state") == "missed" and page.is_visible("#facts")
         page.keyboard.press("[")
         page.wait_for_function("k => page.store.frame === 0 && page.store.selectedResult?.k === k", arg=missed[-1])

@@ -85,14 +85,14 @@ def test_arrow_key_moves_the_box_after_class_selection(page, labels, person):
     for key in "ArrowDown", "Enter":  # in the opened list
         page.keyboard.press(key)
     labels.wait(page, number, lambda t: t["class"] != "Pedestrian")
-    chosen = labels.tracks()[number]["class"]
+    new_class = labels.tracks()[number]["class"]
     page.keyboard.press("ArrowUp")
     labels.wait(page, number, lambda t: get_boxes(t)[0] != before)
-    assert labels.tracks()[number]["class"] == chosen
+    assert labels.tracks()[number]["class"] == new_class
     page.route("**/api/do*", lambda route: route.abort())
     page.select_option("#class", "Car")
     page.wait_for_selector("#errors .toast")
-    page.wait_for_function("c => document.getElementById('class').value === c", arg=chosen)
+    page.wait_for_function("c => document.getElementById('class').value === c", arg=new_class)
     page.unroute("**/api/do*")
     page.click("#errors .toast button")
 

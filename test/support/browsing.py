@@ -30,6 +30,6 @@ def browsing() -> Iterator:
     if (path := next(filter(None, map(shutil.which, BROWSERS)), None)) is None:
         pytest.skip("chromium is not installed")
     with sync_api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=path, args=FLAGS)
-        yield started
-        started.close()
+        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        yield browser
+        browser.close()

@@ -107,9 +107,9 @@ def error(kind, true, found, name):
         shared = math.prod(map(min, true["size"], found["size"]))
         return 1 - shared / (math.prod(true["size"]) + math.prod(found["size"]) - shared)
     if kind == "orientation":
-        turned = abs(yaw(true["rotation"]) - yaw(found["rotation"])) % (2 * math.pi)
-        turned = min(turned, 2 * math.pi - turned)
-        return min(turned, math.pi - turned) if name == "barrier" else turned
+        yaw_error = abs(yaw(true["rotation"]) - yaw(found["rotation"])) % (2 * math.pi)
+        yaw_error = min(yaw_error, 2 * math.pi - yaw_error)
+        return min(yaw_error, math.pi - yaw_error) if name == "barrier" else yaw_error
     if kind == "velocity":
         if true["velocity"] is None or any(math.isnan(v) for v in found["velocity"]):
             return None
@@ -174,11 +174,11 @@ def evaluate(tables, results, classes):
 
 
 def over(by_class, names):
-    chosen = [by_class[name] for name in names]
-    mean_ap = sum(sum(ap.values()) / 4 for _, ap, _ in chosen) / len(chosen)
+    rows = [by_class[name] for name in names]
+    mean_ap = sum(sum(ap.values()) / 4 for _, ap, _ in rows) / len(rows)
     errors = {}
     for kind in ERRORS:
-        values = [e[kind] for _, _, e in chosen if kind in e]
+        values = [e[kind] for _, _, e in rows if kind in e]
         errors[kind] = sum(values) / len(values)
     nds = (5 * mean_ap + sum(max(0.0, 1 - e) for e in errors.values())) / 10
     return mean_ap, errors, nds

@@ -54,9 +54,9 @@ def test_recorded_poses_come_before_kiss_icp(monkeypatch, installed):
     frames = [Frame("0", 0, lambda: None, pose=lambda: np.eye(4))]
     for poses in True, False:
         recording = Recording(Path("drive"), "", frames, frozenset({POSES} if poses else ()))
-        for wanted in RECORDED_EGO:
-            expected = choose_recorded_source(poses) if wanted == "auto" else wanted
-            assert choose_ego_source(recording, wanted) == expected
+        for source in RECORDED_EGO:
+            expected = choose_recorded_source(poses) if source == "auto" else source
+            assert choose_ego_source(recording, source) == expected
 
 
 @pytest.mark.parametrize("installed", [True, False])
@@ -109,6 +109,6 @@ def test_odometry_registers_small_scans(drive):
     odometry = Odometry()
     for i in range(5):
         at = make_flat_pose(0.1 * i, 0.02 * i, 0.01 * i)
-        seen = near @ at[:3, :3] - at[:3, 3] @ at[:3, :3]
-        found = odometry(seen.astype(np.float32))
+        sensor_points = near @ at[:3, :3] - at[:3, 3] @ at[:3, :3]
+        found = odometry(sensor_points.astype(np.float32))
     np.testing.assert_allclose(found, at, atol=0.05)

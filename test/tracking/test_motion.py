@@ -56,12 +56,12 @@ def test_constant_turn_rate_gives_a_circle():
 
 def test_update_shrinks_covariance_and_moves_to_measurement():
     means, p = np.zeros((4, 6)), draw_covariances(1, 4)
-    measured = np.full((4, 3), 0.3)
-    after, narrower = update(means, p, measured, np.full((4, 3), 0.1))
+    measurement = np.full((4, 3), 0.3)
+    after, narrower = update(means, p, measurement, np.full((4, 3), 0.1))
     assert (np.linalg.eigvalsh(p - narrower) > -1e-9).all()
     assert (np.linalg.eigvalsh(narrower) > 0).all()
-    sure, _ = update(means, p, measured, np.full((4, 3), 1e-5))
-    np.testing.assert_allclose(sure[:, [0, 1, 4]], measured, atol=1e-4)
+    sure, _ = update(means, p, measurement, np.full((4, 3), 1e-5))
+    np.testing.assert_allclose(sure[:, [0, 1, 4]], measurement, atol=1e-4)
     assert (np.abs(after[:, :2] - 0.3) < 0.3 + 1e-9).all()
 
 

@@ -22,11 +22,11 @@ def test_track_starts_after_three_hits_and_ends_after_two_misses():
     tracker, none = PlainAb3dmot(), Detections.none()
     for _ in range(4):
         tracker(none)
-    shown = [
+    track_counts = [
         len(tracker(found)[0])
         for found in (make_detection(10), make_detection(11), make_detection(12), none, none, make_detection(15))
     ]
-    assert shown == [0, 0, 1, 1, 0, 0]
+    assert track_counts == [0, 0, 1, 1, 0, 0]
 
 
 def test_plain_tracker_follows_car_and_compensates_poses():

@@ -112,8 +112,8 @@ def test_moving_sensor_gives_same_tracks_as_static_one(roll):
 
 def test_velocities_are_relative_without_poses():
     frames = [make_detections(make_car(30 - 0.8 * i)) for i in range(15)]
-    alone = track(frames)[-1]
-    assert alone.velocities[0] == pytest.approx([-8, 0], abs=0.3) and alone.moving[0] > 0.99
+    last_tracks = track(frames)[-1]
+    assert last_tracks.velocities[0] == pytest.approx([-8, 0], abs=0.3) and last_tracks.moving[0] > 0.99
     known = track(frames, [make_flat_pose(0.8 * i) for i in range(15)])[-1]
     assert known.velocities[0] == pytest.approx([0, 0], abs=0.2) and known.moving[0] < 0.4
 

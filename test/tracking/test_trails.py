@@ -17,7 +17,7 @@ from msg_utils.stamps import make_header
 
 @pytest.mark.parametrize("seconds", [0.0, 0.55, 2.0])
 def test_trails_are_the_past_positions_of_tracks(seconds):
-    tracker, trails, seen = Tracker(), Trails(), {}
+    tracker, trails, positions_by_id = Tracker(), Trails(), {}
     for i, found in enumerate(make_crowd_detections(2, 40)):
         at, stamp = make_flat_pose(0.9 * i, 0.1 * i, 0.03 * i), START + i * TENTH
         local = Detections.of(transform_boxes(found.boxes, np.linalg.inv(at)), found.class_ids, found.scores)
@@ -25,8 +25,8 @@ def test_trails_are_the_past_positions_of_tracks(seconds):
         lines = trails(tracks, tracker.pose, stamp, seconds)
         for number, line, box in zip(tracks.ids.tolist(), lines, tracks.detections.boxes):
             np.testing.assert_allclose(line[-1], box[:3], atol=1e-4)
-            seen.setdefault(number, []).append(at[:3, :3] @ box[:3] + at[:3, 3])
-            expected = np.array(seen[number])[-min(int(seconds * 10) + 1, TRAIL_POINTS) :]
+            positions_by_id.setdefault(number, []).append(at[:3, :3] @ box[:3] + at[:3, 3])
+            expected = np.array(positions_by_id[number])[-min(int(seconds * 10) + 1, TRAIL_POINTS) :]
             np.testing.assert_allclose(line @ at[:3, :3].T + at[:3, 3], expected, atol=1e-4)
     assert len(trails(tracks, tracker.pose, stamp, seconds)) == len(tracks)
 

@@ -83,8 +83,10 @@ def fill_boxes(rng, boxes, count=60):
     for box in boxes:
         unit = rng.uniform(-0.49, 0.49, (count, 3)) * box[3:6]
         cos, sin = np.cos(box[6]), np.sin(box[6])
-        turned = np.column_stack([cos * unit[:, 0] - sin * unit[:, 1], sin * unit[:, 0] + cos * unit[:, 1], unit[:, 2]])
-        parts.append(np.column_stack([turned + box[:3], rng.random(count)]))
+        rotated_points = np.column_stack(
+            [cos * unit[:, 0] - sin * unit[:, 1], sin * unit[:, 0] + cos * unit[:, 1], unit[:, 2]]
+        )
+        parts.append(np.column_stack([rotated_points + box[:3], rng.random(count)]))
     points = np.concatenate(parts).astype(np.float32)
     return Clusters(points, np.arange(len(boxes) + 1) * count, np.arange(1, len(boxes) + 1))
 
@@ -218,11 +220,11 @@ class RepeatedScene:
 
 def test_scene_is_cut_by_clustering_and_around_objects(rng, tmp_path):
     scene = make_scene(rng)
-    cut = cut_clusters(scene, CONFIG, 5)
-    assert set(cut.labels[~cut.is_box_crop]) == {0, 1, UNKNOWN}  # the cyclist is not detectable
-    assert cut.labels[cut.is_box_crop].tolist() == [0, 1]
-    assert np.array_equal(cut.boxes[cut.is_box_crop], BOXES[:2])
-    assert not cut.boxes[cut.labels == UNKNOWN].any() and cut.boxes[cut.labels == 1].any()
+    clusters = cut_clusters(scene, CONFIG, 5)
+    assert set(clusters.labels[~clusters.is_box_crop]) == {0, 1, UNKNOWN}  # the cyclist is not detectable
+    assert clusters.labels[clusters.is_box_crop].tolist() == [0, 1]
+    assert np.array_equal(clusters.boxes[clusters.is_box_crop], BOXES[:2])
+    assert not clusters.boxes[clusters.labels == UNKNOWN].any() and clusters.boxes[clusters.labels == 1].any()
     source = CutScenes(RepeatedScene(scene), CONFIG, 5, tmp_path)
     first, second = source.load_scene(0), source.load_scene(0)  # the second one is read from the cache
     assert len(list(tmp_path.iterdir())) == 1
@@ -253,8 +255,8 @@ def test_clusters_equal_those_of_detector_at_scene_height(rng):
         ),
     )
     detector(PointCloud(scene.points[:, :3].copy(), scene.points[:, 3].copy()))
-    cut = cut_clusters(scene, CONFIG, 5)
-    assert sum(read) == (~cut.is_box_crop).sum() > 3
+    clusters = cut_clusters(scene, CONFIG, 5)
+    assert sum(read) == (~clusters.is_box_crop).sum() > 3
 
 
 def test_fraction_of_sparse_scenes_is_reproducible(rng, tmp_path):
@@ -303,9 +305,9 @@ def test_half_of_the_background_samples_are_decoys(rng):
     for decoys in (0, 4, 30):
         is_box_crop = np.isin(np.arange(len(scene.labels)), background[:decoys])
         judge = ClusterPreparation(CONFIG, ClusterAugmentParams(background=20), True)
-        chosen = judge._draw_clusters(replace(scene, is_box_crop=is_box_crop), rng)
-        assert (scene.labels[chosen] == 3).sum() == 20
-        assert is_box_crop[chosen].sum() == min(decoys, 10)
+        drawn_rows = judge._draw_clusters(replace(scene, is_box_crop=is_box_crop), rng)
+        assert (scene.labels[drawn_rows] == 3).sum() == 20
+        assert is_box_crop[drawn_rows].sum() == min(decoys, 10)
 
 
 def sample_scene(rng, count=40):

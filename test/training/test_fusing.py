@@ -77,8 +77,8 @@ def test_fitted_scores_are_probabilities_in_any_order_of_scans(seed):
     other = draw_samples(rng, 20_000, PEDESTRIAN)
     scores = compute_probabilities(models, other.class_ids, other.evidence)
     for low in np.arange(0.1, 0.9, 0.2):
-        chosen = (scores >= low) & (scores < low + 0.2)
-        assert abs(other.correct[chosen].mean() - scores[chosen].mean()) < 0.08
+        in_bin = (scores >= low) & (scores < low + 0.2)
+        assert abs(other.correct[in_bin].mean() - scores[in_bin].mean()) < 0.08
     assert fits["Pedestrian"].new_score.loss < fits["Pedestrian"].old_score.loss
     assert fits["Pedestrian"].proposals == 4000
     assert fits["Pedestrian"].correct == own.correct.sum()
@@ -215,20 +215,20 @@ def test_missing_class_and_foreign_sensor_are_reported(others):
 
 def test_detector_uses_curves_of_its_file_at_any_range(others):
     path, models = others
-    loaded, package = load_fused_detector(path, "cpu"), load_fused_detector("", "cpu")
-    mine = FusedDetector(make_random_detector("v4").proposer, loaded.classifier, loaded.params, models)
-    theirs = FusedDetector(mine.proposer, package.classifier, package.params)
+    own_detector, package_detector = load_fused_detector(path, "cpu"), load_fused_detector("", "cpu")
+    mine = FusedDetector(make_random_detector("v4").proposer, own_detector.classifier, own_detector.params, models)
+    theirs = FusedDetector(mine.proposer, package_detector.classifier, package_detector.params)
     scan = make_scan()
     odds = [detector.with_min_score(0.0)(scan).detections for detector in (mine, theirs)]
     assert len(odds[0]) and not are_equal_detections(*odds)
-    around = loaded.with_range("around")
-    assert around.models is loaded.models and around.warning is None
-    half = with_values(loaded.params, {"fused.amp": "bf16", "fused.warm_up": False})
+    around = own_detector.with_range("around")
+    assert around.models is own_detector.models and around.warning is None
+    half = with_values(own_detector.params, {"fused.amp": "bf16", "fused.warm_up": False})
     assert load_fused_detector(path, "cpu", half).proposer.network.amp == "bf16"
 
 
 def test_damaged_file_is_accepted_or_rejected_in_one_line(tmp_path):
-    rng, path, refused = np.random.default_rng(0), tmp_path / "damaged.json", 0
+    rng, path, rejected_count = np.random.default_rng(0), tmp_path / "damaged.json", 0
     evidence = {name: np.array([-9.0, 0.0, np.nan, np.inf]) for name in KNOTS}
     for _ in range(100):
         path.write_text(mutate_text(SHIPPED_FILE.read_text(), rng)[0])
@@ -236,12 +236,12 @@ def test_damaged_file_is_accepted_or_rejected_in_one_line(tmp_path):
             models = read_fusion(path).models
         except InputError as error:
             assert "damaged.json" in str(error) and "\n" not in str(error)
-            refused += 1
+            rejected_count += 1
             continue
         for name in DETECTED:
             scores = compute_probabilities(models, np.full(4, CLASSES.index(name)), evidence)
             assert ((scores >= 0) & (scores <= 1)).all()
-    assert 15 < refused < 100
+    assert 15 < rejected_count < 100
 
 
 def test_fusion_file_is_compared_as_separate_detector(others):

@@ -177,5 +177,5 @@ def test_samples_do_not_depend_on_sensor_height(tmp_path):
     assert open_labelled_frames(path, height=1.1, with_simulated=True).to_scenes().load_scene(0).height == 1.1
     folder = write_object_folder(tmp_path / "kitti", make_walker_label() + "\n", 1)
     assert open_labelled_frames(folder, height=1.1).to_scenes().load_scene(0).height == 1.1
-    mixed = open_labelled_frames(folder, height=1.1, with_simulated=True).to_scenes()
-    assert mixed.load_scene(0).height == SENSOR_HEIGHT
+    scenes = open_labelled_frames(folder, height=1.1, with_simulated=True).to_scenes()
+    assert scenes.load_scene(0).height == SENSOR_HEIGHT

@@ -86,25 +86,25 @@ def read_tensors(out: Path) -> bytes:
 
 
 def test_run_killed_twice_equals_uninterrupted_run(tmp_path, one_thread):
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    unbroken = CliRunner().invoke(cli, small_training(whole, "--jobs", "2"))
+    complete_run, killed_run = tmp_path / "whole", tmp_path / "broken"
+    unbroken = CliRunner().invoke(cli, small_training(complete_run, "--jobs", "2"))
     assert unbroken.exit_code == 0, unbroken.exception
     lines = unbroken.stderr.splitlines()
     assert "6 street scans of generic" in lines[1] and "4 steps of 1 scenes" in lines[1]
     assert "simulating" in lines[2] and "validation" in lines[2]
 
-    scans = broken / "scans"
-    kill_when(lambda: len(list(scans.glob("*.npz"))) >= 2, *small_training(broken))
-    assert not (broken / STATE).exists()
+    scans = killed_run / "scans"
+    kill_when(lambda: len(list(scans.glob("*.npz"))) >= 2, *small_training(killed_run))
+    assert not (killed_run / STATE).exists()
     before = {path: path.stat().st_mtime_ns for path in scans.rglob("*.npz")}
-    refused = CliRunner().invoke(cli, small_training(broken))
-    assert isinstance(refused.exception, InputError) and "--resume" in str(refused.exception)
-    kill_when((broken / STATE).exists, *small_training(broken, "--resume"))
+    rejected_run = CliRunner().invoke(cli, small_training(killed_run))
+    assert isinstance(rejected_run.exception, InputError) and "--resume" in str(rejected_run.exception)
+    kill_when((killed_run / STATE).exists, *small_training(killed_run, "--resume"))
     assert {path: path.stat().st_mtime_ns for path in before} == before  # not rewritten
-    assert CliRunner().invoke(cli, small_training(broken, "--resume")).exit_code == 0
-    assert read_tensors(broken) == read_tensors(whole)
-    cached = {path.relative_to(broken): path.read_bytes() for path in broken.rglob("*.npz")}
-    assert cached == {path.relative_to(whole): path.read_bytes() for path in whole.rglob("*.npz")}
+    assert CliRunner().invoke(cli, small_training(killed_run, "--resume")).exit_code == 0
+    assert read_tensors(killed_run) == read_tensors(complete_run)
+    cached = {path.relative_to(killed_run): path.read_bytes() for path in killed_run.rglob("*.npz")}
+    assert cached == {path.relative_to(complete_run): path.read_bytes() for path in complete_run.rglob("*.npz")}
 
 
 def refuse(tmp_path: Path, *more: str) -> str:
@@ -251,9 +251,9 @@ def test_unusable_first_scenes_are_skipped(kind, tmp_path, one_thread):
     assert header.find_height_mismatch(SENSOR_HEIGHT) is None
     assert "for a sensor at 1.73" in header.find_height_mismatch(0.6)
     write_file(held, "000002\n000003\n")
-    refused = small_run(kind, tmp_path / "other", root, "--val-split", str(held)).exception
-    assert isinstance(refused, InputError) and "\n" not in str(refused)
-    assert "no usable validation frame" in str(refused) and "000002.bin" in str(refused)
+    error = small_run(kind, tmp_path / "other", root, "--val-split", str(held)).exception
+    assert isinstance(error, InputError) and "\n" not in str(error)
+    assert "no usable validation frame" in str(error) and "000002.bin" in str(error)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -134,11 +134,11 @@ def test_state_is_saved_if_loading_samples_fails(uninterrupted_run, tmp_path):
 
 
 def test_full_disk_leaves_last_good_state(uninterrupted_run, tmp_path, monkeypatch):
-    saved = []
+    descriptors = []
 
     def full(descriptor):
-        saved.append(descriptor)
-        if len(saved) > 3:
+        descriptors.append(descriptor)
+        if len(descriptors) > 3:
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(files.os, "fsync", full)

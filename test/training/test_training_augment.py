@@ -84,7 +84,7 @@ def test_find_points_in_box_agrees_with_points_in_box(seed, margin):
 def test_points_stay_in_their_boxes(seed):
     scene, rng = make_random_scene(seed), np.random.default_rng(seed)
     before = find_points_of_boxes(scene)
-    for changed in (
+    for changed_scene in (
         flip_scene(scene),
         rotate_scene(scene, rng.uniform(-4, 4)),
         scale_scene(scene, rng.uniform(0.8, 1.2)),
@@ -92,12 +92,13 @@ def test_points_stay_in_their_boxes(seed):
         change_intensity(scene, rng.uniform(0.5, 1.5), rng.uniform(-0.3, 0.3)),
         move_objects(scene, 0.5, 0.5, rng),
     ):
-        assert changed.points.dtype == np.float32 and changed.points.shape == scene.points.shape
-        assert not (before & ~find_points_of_boxes(changed, margin=2e-4)).any()
+        assert changed_scene.points.dtype == np.float32 and changed_scene.points.shape == scene.points.shape
+        assert not (before & ~find_points_of_boxes(changed_scene, margin=2e-4)).any()
         np.testing.assert_allclose(
-            changed.boxes[:, 3:6] / scene.boxes[:, 3:6], (changed.boxes[:1, 3:4] / scene.boxes[:1, 3:4]).sum() or 1
+            changed_scene.boxes[:, 3:6] / scene.boxes[:, 3:6],
+            (changed_scene.boxes[:1, 3:4] / scene.boxes[:1, 3:4]).sum() or 1,
         )
-        assert any_touch(changed.boxes) is False
+        assert any_touch(changed_scene.boxes) is False
 
 
 @given(seeds, st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
@@ -127,9 +128,9 @@ def test_positive_rotation_is_counterclockwise():
     scene = TrainingScene(
         np.array([[5, 0, 1, 0.5]], np.float32), np.array([[5.0, 0, 1, 4, 2, 1, 0.1]]), np.array([CAR]), np.ones(1, bool)
     )
-    changed = rotate_scene(scene, np.pi / 2)
-    np.testing.assert_allclose(changed.points, [[0, 5, 1, 0.5]], atol=1e-6)
-    np.testing.assert_allclose(changed.boxes, [[0, 5, 1, 4, 2, 1, 0.1 + np.pi / 2]], atol=1e-9)
+    rotated_scene = rotate_scene(scene, np.pi / 2)
+    np.testing.assert_allclose(rotated_scene.points, [[0, 5, 1, 0.5]], atol=1e-6)
+    np.testing.assert_allclose(rotated_scene.boxes, [[0, 5, 1, 4, 2, 1, 0.1 + np.pi / 2]], atol=1e-9)
 
 
 @given(seeds, st.floats(0, 0.99))
@@ -145,9 +146,9 @@ def test_drop_points_keeps_the_fraction_and_order(seed, share):
 @given(seeds)
 def test_intensity_stays_within_0_and_1_and_0_stays_0(seed):
     scene = make_random_scene(seed)
-    changed = change_intensity(scene, 1.4, 0.2)
-    assert changed.points[:, 3].min() >= 0 and changed.points[:, 3].max() <= 1
-    assert np.array_equal(changed.points[:, :3], scene.points[:, :3])
+    changed_scene = change_intensity(scene, 1.4, 0.2)
+    assert changed_scene.points[:, 3].min() >= 0 and changed_scene.points[:, 3].max() <= 1
+    assert np.array_equal(changed_scene.points[:, :3], scene.points[:, :3])
     scene.points[::2, 3] = 0  # weak returns without an intensity
     assert (change_intensity(scene, 1.4, 0.2).points[::2, 3] == 0).all()
 
@@ -244,13 +245,13 @@ def test_pasted_object_casts_shadow_and_is_not_hidden(seed):
     count = len(make_walker(8.0).points)
     rest, own = fuller.points[:-count], fuller.points[-count:]
     assert points_in_box(own, box, 1e-4).all()
-    seen = rest[(rest[:, 0] == 12) & (rest[:, 2] > -1.72)]
+    visible_points = rest[(rest[:, 0] == 12) & (rest[:, 2] > -1.72)]
     # rays from the sensor to the remaining points of the wall miss the walker
     for share in np.linspace(0.5, 0.95, 40):
-        assert not points_in_box(seen * np.float32(share), box - [0, 0, 0, 0.35, 0.3, 0.1, 0]).any()
-    assert len(seen) > 0.8 * len(behind)
+        assert not points_in_box(visible_points * np.float32(share), box - [0, 0, 0, 0.35, 0.3, 0.1, 0]).any()
+    assert len(visible_points) > 0.8 * len(behind)
     if abs(np.arctan2(box[1], box[0])) < 0.6:
-        assert len(seen) < len(behind)
+        assert len(visible_points) < len(behind)
     hidden = paste_objects(scene, make_walker(14.0), params, *AREA, rng)
     assert len(hidden.boxes) == 0 or abs(np.arctan2(*hidden.boxes[0, 1::-1])) > 0.45
     assert len(paste_objects(make_street(), make_walker(14.0), params, *AREA, rng).boxes) == 1
@@ -321,9 +322,9 @@ def test_stretched_background_stays_on_the_ground(seed):
         assert stretched[2] - stretched[5] / 2 == pytest.approx(box[2] - box[5] / 2)
         assert stretched[[0, 1, 6]] == pytest.approx(box[[0, 1, 6]])
         assert (np.abs(np.log(stretched[3:6] / box[3:6])) <= 0.5).all()
-        same, still = vary_background_box(box, own, STILL_THINGS, rng)
-        np.testing.assert_allclose(same, box, atol=1e-12)
-        np.testing.assert_allclose(still, own, atol=1e-6)
+        same_box, unchanged_box = vary_background_box(box, own, STILL_THINGS, rng)
+        np.testing.assert_allclose(same_box, box, atol=1e-12)
+        np.testing.assert_allclose(unchanged_box, own, atol=1e-6)
 
 
 @given(seeds, st.sampled_from([-1, 1]), st.sampled_from([-1, 1]))

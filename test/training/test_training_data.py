@@ -75,8 +75,8 @@ def test_hidden_simulated_objects_are_not_detectable():
     source = SimulatedScenes(7, 1, SENSOR)
     _, truth = source.load_scan(0)
     scene = source.load_scene(0)
-    seen = [e["visible"] >= 0.15 and e["num_points"] >= 5 for e in truth.extras]
-    assert scene.all_around and scene.detectable.tolist() == seen and 0 < sum(seen) < len(seen)
+    is_visible = [e["visible"] >= 0.15 and e["num_points"] >= 5 for e in truth.extras]
+    assert scene.all_around and scene.detectable.tolist() == is_visible and 0 < sum(is_visible) < len(is_visible)
     assert drive.simulate_scan(7, 0, SENSOR).frame.xyz.shape == scene.points[:, :3].shape
     assert scene.height == source.load_frame(0).sensor_height == 1.73
 
@@ -224,8 +224,8 @@ def test_validation_without_camera_keeps_labels_in_range(view):
     source = SimulatedScenes(7, 1, SENSOR, Scenes(None, 3.0, "campus"))
     known = source.load_frame(0).truth()
     truth = load_validation_frame(config, source, 0).truth()
-    seen = is_within(known.boxes, config.low, config.high)
-    assert np.array_equal(truth.boxes, known.boxes[seen]) and len(truth.extras) == len(truth)
+    in_range = is_within(known.boxes, config.low, config.high)
+    assert np.array_equal(truth.boxes, known.boxes[in_range]) and len(truth.extras) == len(truth)
     assert 0 < len(truth) and (len(truth) < len(known) or view == "around")
 
 
@@ -304,10 +304,10 @@ def test_rotating_the_camera_equals_rotating_the_scene(quarter):
     boxes = truth.boxes.copy()
     boxes[:, :2] = boxes[:, :2] @ np.array([[cos, sin], [-sin, cos]])
     boxes[:, 6] = wrap_angle(boxes[:, 6] - yaw)
-    turned = make_kitti_labels(GroundTruth.of(boxes, truth.class_ids, truth.extras))
-    seen = make_kitti_labels(truth, rotate_camera(yaw))
-    assert [e["track_id"] for e in seen.extras] == [e["track_id"] for e in turned.extras]
-    assert len(seen.notes) == len(turned.notes)
+    rotated_labels = make_kitti_labels(GroundTruth.of(boxes, truth.class_ids, truth.extras))
+    camera_labels = make_kitti_labels(truth, rotate_camera(yaw))
+    assert [e["track_id"] for e in camera_labels.extras] == [e["track_id"] for e in rotated_labels.extras]
+    assert len(camera_labels.notes) == len(rotated_labels.notes)
     frame = SimulatedScenes(4, 8, SENSOR, all_around=True).load_frame(quarter + 4)
     assert np.allclose(frame.calibration().lidar_to_camera, rotate_camera(yaw).lidar_to_camera)
 

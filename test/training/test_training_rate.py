@@ -81,11 +81,11 @@ def test_norm_statistics_start_as_mean_over_steps():
     run, norm = Run(toy.task(), PARAMS, torch.device("cpu")), toy.module[1]
     norm.momentum = 0.0
     run.norms = [(norm, 0.01)]
-    seen = []
-    toy.module[0].register_forward_hook(lambda *call: seen.append(call[2].mean(dim=0).detach()))
+    samples = []
+    toy.module[0].register_forward_hook(lambda *call: samples.append(call[2].mean(dim=0).detach()))
     for batch, _ in zip(toy.batches(0), range(5)):
         run.step(batch)
-    assert torch.allclose(norm.running_mean, torch.stack(seen).mean(dim=0), atol=1e-6)
+    assert torch.allclose(norm.running_mean, torch.stack(samples).mean(dim=0), atol=1e-6)
 
 
 # a budget that is too short

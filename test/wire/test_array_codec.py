@@ -65,7 +65,7 @@ def test_encoded_markers_equal_the_serialized_message(rows, stamp_ns, frame_id, 
 
 
 def test_encoded_tracks_equal_the_serialized_message():
-    tracker, trails, shown = Tracker(), Trails(), ()
+    tracker, trails, previous = Tracker(), Trails(), ()
     for i, frame_detections in enumerate(make_crowd_detections(4, 15)):
         stamp = START + i * TENTH
         tracks = tracker(frame_detections if i < 12 else Detections.none(), stamp)
@@ -75,12 +75,12 @@ def test_encoded_tracks_equal_the_serialized_message():
             tracks.velocities,
             tracks.moving,
             trails(tracks, tracker.pose, stamp, 2.0),
-            previous=shown,
+            previous=previous,
         )
-        shown = list_marker_keys(track_rows)
+        previous = list_marker_keys(track_rows)
         for rows in (track_rows, make_detection_rows(frame_detections)):
             assert_equal_cdr(encode_markers(rows, make_any_header(make_bag_message, stamp)), rows, stamp)
-    assert shown
+    assert previous
 
 
 def test_encoded_empty_array_equals_the_serialized_message():

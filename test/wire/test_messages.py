@@ -165,8 +165,10 @@ def test_intensities_of_every_driver_are_scaled_to_1(kind, full):
     assert read.intensity.dtype == np.float32 and find_scale_problem(read.intensity) is None
     if np.dtype(kind).kind == "f":
         points["intensity"][1:4] = np.nan, np.inf, -np.inf
-        odd = to_point_cloud(from_array(points, make_any_header(make_bag_message), make_bag_message), 0.0)[0].intensity
-        assert not odd[1:4].any() and np.array_equal(odd[4:], read.intensity[4:])
+        invalid_intensity = to_point_cloud(
+            from_array(points, make_any_header(make_bag_message), make_bag_message), 0.0
+        )[0].intensity
+        assert not invalid_intensity[1:4].any() and np.array_equal(invalid_intensity[4:], read.intensity[4:])
     points["intensity"] = points["intensity"] * 0.02  # an unusual scale
     dark = to_point_cloud(from_array(points, make_any_header(make_bag_message), make_bag_message), float(full))[0]
     assert "input.intensity_max" in find_scale_problem(dark.intensity)

@@ -59,15 +59,15 @@ def test_times_of_every_driver_are_read_in_seconds(driver, order):
 def test_motion_compensated_points_have_the_time_of_the_stamp(driver):
     name, values = DRIVERS[driver]
     msg = cloud(name, values)
-    chosen = np.arange(0, 1000, 3)
+    rows = np.arange(0, 1000, 3)
     frame, _ = to_point_cloud(msg)
-    moved_xyz = frame.xyz[chosen] + np.float32([1, 2, 3])
-    times = read_point_times(msg, chosen)
-    after = replace_points(msg, make_bag_message, chosen, moved_xyz, times)
+    moved_xyz = frame.xyz[rows] + np.float32([1, 2, 3])
+    times = read_point_times(msg, rows)
+    after = replace_points(msg, make_bag_message, rows, moved_xyz, times)
     assert [f.name for f in after.fields] == [f.name for f in msg.fields]
     assert (after.point_step, after.width) == (msg.point_step, msg.width)
-    np.testing.assert_array_equal(to_point_cloud(after)[0].xyz[chosen], moved_xyz)
-    others = np.setdiff1d(all_indices(msg), chosen)
+    np.testing.assert_array_equal(to_point_cloud(after)[0].xyz[rows], moved_xyz)
+    others = np.setdiff1d(all_indices(msg), rows)
     np.testing.assert_array_equal(
         to_array(after)[others][["x", "y", "z", "intensity"]], to_array(msg)[others][["x", "y", "z", "intensity"]]
     )

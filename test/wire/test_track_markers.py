@@ -19,7 +19,7 @@ from msg_utils.markers import ADD, DELETE, from_marker_array, list_marker_keys
 
 def make_frames(make, frames=20):
     """Yield the tracks and markers of each frame; each array gets the previous one."""
-    tracker, trails, shown = Tracker(), Trails(), ()
+    tracker, trails, previous = Tracker(), Trails(), ()
     for i, frame_detections in enumerate(make_crowd_detections(4, frames)):
         stamp = START + i * TENTH
         tracks = tracker(frame_detections if i < 12 else Detections.none(), stamp)
@@ -31,10 +31,10 @@ def make_frames(make, frames=20):
             trails(tracks, tracker.pose, stamp, 2.0),
             make_any_header(make, stamp),
             make,
-            previous=shown,
+            previous=previous,
             lifetime_ns=10**9,
         )
-        shown = list_marker_keys(message)
+        previous = list_marker_keys(message)
         yield tracks, message
 
 
