@@ -138,18 +138,12 @@ class TrackOutputs:
         while now - self.count_history[0][0] > RATE_WINDOW_S or len(self.count_history) > 1000:
             self.count_history.popleft()
         begin, started_count, ended_count = self.count_history[0]
-        self.node.diagnostics.counts.update(
-            ego=self.ego.source,
-            tracks=track_count,
-            alive=tracker.alive_count,
-            born=tracker.started_count,
-            ended=tracker.ended_count,
-        )
+        counts = self.node.diagnostics.counts
+        counts.update(ego=self.ego.source, tracks=track_count, alive=tracker.alive_count)
+        counts.update(born=tracker.started_count, ended=tracker.ended_count)
         if now > begin:
-            self.node.diagnostics.counts["born_per_s"] = (
-                f"{(tracker.started_count - started_count) / (now - begin):.2f}"
-            )
-            self.node.diagnostics.counts["ended_per_s"] = f"{(tracker.ended_count - ended_count) / (now - begin):.2f}"
+            counts["born_per_s"] = f"{(tracker.started_count - started_count) / (now - begin):.2f}"
+            counts["ended_per_s"] = f"{(tracker.ended_count - ended_count) / (now - begin):.2f}"
 
 
 def find_marker_lifetime_ns(node: LidarNode) -> int:

@@ -290,11 +290,7 @@ class Transforms:
         return self.look_up_odometry_poses(at, max_gap) @ self._find_child_poses(frame_id, at, max_gap)
 
     def look_up_odometry_poses(self, at: np.ndarray, max_gap: float | None = None) -> np.ndarray:
-        """Return the (M, 4, 4) poses of the child frame of the odometry at times (M,) ns.
-
-        Raises:
-            MissingTransform: the poses are not available.
-        """
+        """Return the (M, 4, 4) poses of the child frame of the odometry at times (M,) ns, or raise MissingTransform."""
         if self.odometry_ns is None:
             topic = self.node.resolve_topic_name("~/input/odometry")
             raise MissingTransform(f"no odometry on {topic}; remap it to the topic of the odometry")
