@@ -14,29 +14,29 @@ ROOT = Path(__file__).resolve().parent  # colcon links setup.py elsewhere
 VERSION = run_path("lidar_perception/__init__.py")["__version__"]
 
 
-def repository_url() -> str:
-    """Return the https address of the repository, or "" where it has none.
+def find_repository_url() -> str:
+    """Return the https address of the repository, or "" if it is unknown.
 
-    LIDAR_REPOSITORY_URL or git's remote `origin` says it, so that a fork's wheel links to the fork.
+    It is LIDAR_REPOSITORY_URL or git's remote `origin`, so that the wheel of a fork links to the fork.
     """
     url = os.environ.get("LIDAR_REPOSITORY_URL", "")
     if not url and (ROOT / ".git").exists():
-        asked = subprocess.run(
+        remote = subprocess.run(
             ["git", "-C", str(ROOT), "config", "remote.origin.url"], capture_output=True, text=True, check=False
         )
-        url = re.sub(r"^git@([^:]+):", r"https://\1/", asked.stdout.strip())
+        url = re.sub(r"^git@([^:]+):", r"https://\1/", remote.stdout.strip())
     return url.removesuffix(".git").rstrip("/") if url.startswith("https://") else ""
 
 
-def index_page(text: str, url: str) -> str:
-    """Return the README with absolute links, as a package index shows it without the repository."""
+def make_index_page(text: str, url: str) -> str:
+    """Return the README with absolute links, because a package index shows it outside the repository."""
     if not url:
         return text
     text = re.sub(r"(!\[[^\]]*\]\()(?!https?:)", rf"\1{url}/raw/main/", text)
     return re.sub(r"((?<!\!)\[[^\]]*\]\()(?!https?:|#)", rf"\1{url}/blob/main/", text)
 
 
-def project_urls(url: str) -> dict[str, str]:
+def list_project_urls(url: str) -> dict[str, str]:
     pages = {
         "Source": "",
         "Documentation": "/tree/main/docs",
@@ -47,16 +47,16 @@ def project_urls(url: str) -> dict[str, str]:
 
 
 class WithDataFiles(Distribution):
-    """Editable installs get the data files too, or ros2 run and ros2 launch would not find us.
+    """Distribution whose editable installation includes the data files, which ros2 run and ros2 launch need.
 
-    setuptools asks for `has_data` there (_run_install in setuptools/command/editable_wheel.py, 84),
-    which its own class calls has_data_files.
+    For an editable installation, setuptools 84 reads the attribute `has_data` (_run_install in
+    setuptools/command/editable_wheel.py), but its own class has only has_data_files.
     """
 
     has_data = Distribution.has_data_files
 
 
-URL = repository_url()
+URL = find_repository_url()
 
 setup(
     distclass=WithDataFiles,
@@ -64,11 +64,11 @@ setup(
     version=VERSION,
     description="LiDAR perception for ROS 2: ground, clusters, pedestrian candidates, learned "
     "detectors, tracks, a simulator and training",
-    long_description=index_page((ROOT / "README.md").read_text(), URL),
+    long_description=make_index_page((ROOT / "README.md").read_text(), URL),
     long_description_content_type="text/markdown",
     license="Apache-2.0",
     url=URL or None,
-    project_urls=project_urls(URL),
+    project_urls=list_project_urls(URL),
     maintainer="lidar_perception maintainers",
     keywords=[
         "lidar",
@@ -114,7 +114,7 @@ setup(
         (f"share/{NAME}/launch", glob("launch/*.launch.py")),
         (f"share/{NAME}/config", glob("config/*.*")),
         (f"share/{NAME}/config/sensors", glob("config/sensors/*")),
-        (f"lib/{NAME}", glob("scripts/nodes/*")),  # where ros2 run looks, and nowhere else
+        (f"lib/{NAME}", glob("scripts/nodes/*")),  # the only folder that ros2 run searches
     ],
     install_requires=[
         "click>=8.1",

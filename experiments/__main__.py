@@ -20,7 +20,7 @@ def cli() -> None:
     \b
     Examples:
       ./lidar compare /data/kitti/object --json compare.json
-      ./lidar realism /data/kitti/object --png realism.png
+      ./lidar realism /data/kitti/object --json realism.json
       ./lidar reproduce stm-cpa /data/kitti/object --out report
     """
 

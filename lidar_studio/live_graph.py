@@ -22,7 +22,7 @@ from lidar_perception.wire.messages import to_truth
 from lidar_perception.wire.track_markers import read_trails
 from lidar_studio.drive import Scan
 from lidar_studio.results import (
-    detections_with_sources,
+    convert_to_detections,
     get_source_name,
     layers_to_json,
     make_track_id,
@@ -315,7 +315,7 @@ class LiveGraph:
                 kind: {t: o for t, o in objects.items() if t in self.topics and self.topics[t].kind == kind}
                 for kind in (BOXES, LABELS)
             }
-        detections = {get_source_name(t): detections_with_sources(o) for t, o in objects_by_kind[BOXES].items()}
+        detections = {get_source_name(t): convert_to_detections(o) for t, o in objects_by_kind[BOXES].items()}
         truth = next((to_truth(o) for o in objects_by_kind[LABELS].values()), None)
         matches = (
             {}

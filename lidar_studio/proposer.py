@@ -43,7 +43,7 @@ SAME_TRACK_DISTANCE_M, SAME_TRACK_LENGTH_FRACTION = 0.7, 0.4
 
 
 class Proposer:
-    """Computes track proposals for a drive.
+    """Proposer of tracks in a drive.
 
     Attributes:
         detector: Detector to use, or None to propose tracks from seeds only.
@@ -90,12 +90,12 @@ class Proposer:
             for survey in new_surveys:
                 if survey is not None:
                     surveys.append(survey)
-                    self._cache(surveys)
+                    self._write_last_file(surveys)
                 if not on_progress(len(surveys)):
                     return False
         return True
 
-    def _cache(self, surveys: list[FrameSurvey]) -> None:
+    def _write_last_file(self, surveys: list[FrameSurvey]) -> None:
         """Write the last file of the cache if all its frames are surveyed."""
         size = survey_cache.FRAMES_PER_FILE
         is_complete = len(surveys) % size == 0 or len(surveys) == len(self.drive.frames)

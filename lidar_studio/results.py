@@ -231,12 +231,12 @@ def read_recorded_results(poses: BagPoses, stamps: list[int]) -> Results:
             tracks += tracks_to_json(frames, topic, trackers.index(topic))
         else:
             sources[get_source_name(topic)] = _make_source(
-                {i: detections_with_sources(objects) for i, objects in frames.items()}
+                {i: convert_to_detections(objects) for i, objects in frames.items()}
             )
     return Results(sources, tuple(tracks))
 
 
-def detections_with_sources(objects: MarkedObjects) -> Detections:
+def convert_to_detections(objects: MarkedObjects) -> Detections:
     """Convert markers to detections, with the probabilities by source that the markers' text contains."""
     probabilities = [e["sources"] if isinstance(e.get("sources"), dict) else {} for e in objects.extras]
     names = list(dict.fromkeys(name for row in probabilities for name in row))[:MAX_SOURCES]
@@ -314,7 +314,7 @@ def tracks_to_json(frames: Mapping[int, MarkedObjects], topic: str, tracker: int
                     "uncertainty": 0.0,
                 },
             )
-            track["class"] = label  # the latest class counts
+            track["class"] = label  # keep the latest class
             track["score"] = max(track["score"], float(score))
             track["boxes"].append([i, *map(float, box), "proposed"])
     return list(tracks.values())

@@ -135,7 +135,7 @@ class Server:
     async def check_request(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Reject requests from other origins or without the token, and convert exceptions to one-line errors."""
         host = (request.host or "").rsplit(":", 1)[0]
-        token = request.query.get("token") or request.cookies.get(_cookie_name(request)) or ""
+        token = request.query.get("token") or request.cookies.get(_get_cookie_name(request)) or ""
         origin = request.headers.get("Origin")
         if host not in HOSTS or (origin is not None and origin != f"http://{request.host}"):
             return web.Response(status=403, text="this page is only available on this machine\n")
@@ -146,12 +146,12 @@ class Server:
         try:
             response = await handler(request)
         except InputError as error:
-            response = _error_response(400, str(error))
+            response = _make_error_response(400, str(error))
         except web.HTTPException as error:
-            response = _error_response(error.status, error.reason)
+            response = _make_error_response(error.status, error.reason)
         except Exception as error:  # a bug; the server can go on, because the journal still matches the labels
             LOG.exception("%s %s", request.method, request.path)
-            response = _error_response(500, f"internal error: {type(error).__name__}: {shorten_error(error)}")
+            response = _make_error_response(500, f"internal error: {type(error).__name__}: {shorten_error(error)}")
         if not response.prepared:
             response.headers.update(HEADERS)
         return response
@@ -159,14 +159,14 @@ class Server:
     async def send_page(self, request: web.Request) -> web.StreamResponse:
         """Send the HTML page, with a cookie that contains the token for further requests."""
         response = web.FileResponse(PAGE / "index.html")
-        response.set_cookie(_cookie_name(request), self.content.token, httponly=True, samesite="Strict", path="/")
+        response.set_cookie(_get_cookie_name(request), self.content.token, httponly=True, samesite="Strict", path="/")
         return response
 
     async def send_static_file(self, request: web.Request) -> web.StreamResponse:
         """Send a file of the page."""
         name = request.match_info["name"]
         if name not in {p.name for p in PAGE.iterdir() if p.is_file()}:
-            return _error_response(404, f"no such file: {name[:40]}")
+            return _make_error_response(404, f"no such file: {name[:40]}")
         return web.FileResponse(PAGE / name)
 
     async def send_drive(self, request: web.Request) -> web.StreamResponse:
@@ -265,7 +265,7 @@ class Server:
                 await self.run_in_thread(partial(session.proposer.compare_with_seed, session.state, track, frame))
             )
         except InputError as error:
-            return _error_response(404, str(error))
+            return _make_error_response(404, str(error))
 
     async def send_next_track(self, request: web.Request) -> web.StreamResponse:
         """Send the id of the next uncertain track, and the frame in which the object is nearest."""
@@ -289,12 +289,12 @@ def _parse_number(text: str) -> int | None:
     return int(text[:18]) if text.isascii() and text.isdigit() else None
 
 
-def _cookie_name(request: web.Request) -> str:
+def _get_cookie_name(request: web.Request) -> str:
     """Return the name of the token's cookie. It contains the port, because servers on a host share cookies."""
     return f"token_{request.url.port}"
 
 
-def _error_response(status: int, text: str) -> web.Response:
+def _make_error_response(status: int, text: str) -> web.Response:
     return web.json_response({"error": text.splitlines()[0] if text else "error"}, status=status)
 
 

@@ -21,7 +21,7 @@ Array = np.ndarray[Any, Any]
 BOX_MARGIN_M = 0.3  # margin around a box when searching for its cluster
 # The ground height is fitted to ground points within this distance, if there are enough of them.
 MIN_GROUND_POINTS, MAX_GROUND_DISTANCE_M = 20, 15.0
-MIN_PART_FRACTION = 0.2  # clusters in a box with fewer points, relative to the largest one, are other objects
+MIN_PART_FRACTION = 0.2  # smaller clusters in a box, relative to the largest one, belong to other objects
 # A cluster is part of a clicked vehicle if this fraction of its points is close to the click: within the usual
 # length times this ratio.
 MIN_INSIDE_FRACTION, PART_RADIUS_RATIO = 0.8, 0.55

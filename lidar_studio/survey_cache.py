@@ -89,10 +89,10 @@ def write(folder: Path, key: str, first: int, surveys: Sequence[FrameSurvey]) ->
     poses = [survey.pose for survey in surveys if survey.pose is not None]
     content = io.BytesIO()
     np.savez_compressed(content, key=np.array(key), names=np.array(names, str), poses=np.array(poses), **arrays)
-    write_bytes(folder / _file_name(first), content.getbuffer())
+    write_bytes(folder / _get_file_name(first), content.getbuffer())
 
 
-def _file_name(first: int) -> str:
+def _get_file_name(first: int) -> str:
     return f"{first:06}.npz"
 
 
@@ -100,7 +100,7 @@ def read(folder: Path, key: str) -> tuple[list[FrameSurvey], str]:
     """Return the cached surveys of the first frames, and a message if other cached surveys were ignored."""
     surveys: list[FrameSurvey] = []
     first = 0
-    while (path := folder / _file_name(first)).is_file():
+    while (path := folder / _get_file_name(first)).is_file():
         try:
             with np.load(path) as file:
                 stored_key = str(file["key"])

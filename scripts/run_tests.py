@@ -95,7 +95,7 @@ def run_everything(folder: Path) -> list[str]:
     environment = {**os.environ, "COVERAGE_FILE": str(folder / "coverage")}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)  # so that each module is compiled once
     if sys.version_info >= (3, 12):
-        environment["COVERAGE_CORE"] = "sysmon"  # each line costs time only once
+        environment["COVERAGE_CORE"] = "sysmon"  # measures each line only the first time that it runs
     pytest = ("-m", "pytest", "--cov", "--cov-report=", "--cov-fail-under=0")
     node_tests = [name for name in NODE_TESTS if (ROOT / name).exists()]
     workers = min(os.cpu_count() or 1, MAX_WORKERS)

@@ -11,7 +11,7 @@ from zlib import crc32
 
 import numpy as np
 
-from experiments.clusters.networks import Source, list_compared_sources, list_sources
+from experiments.clusters.networks import DetectorSource, get_compared_sources, get_sources
 from experiments.framework.precision import to_record
 from experiments.framework.trained_models import TrainedModel
 from lidar_perception.clustering.cluster import cluster_obstacles
@@ -68,7 +68,7 @@ def measure_detection(frame: Frame, models: Mapping[str, TrainedModel]) -> dict[
     if truth is None:
         raise InputError(f"{frame.points or frame.name} has no labels; put the label files next to the scans")
 
-    def detect(change: Change, sources: Mapping[str, Source]) -> tuple[dict[str, Any], dict[str, float]]:
+    def detect(change: Change, sources: Mapping[str, DetectorSource]) -> tuple[dict[str, Any], dict[str, float]]:
         results = detect_with_all(change_cloud(frame.load(), change, frame.name), sources, frame.sensor_height)
         return (
             {
@@ -78,8 +78,8 @@ def measure_detection(frame: Frame, models: Mapping[str, TrainedModel]) -> dict[
             {name: round(ms, 3) for name, (_, ms) in results.items()},
         )
 
-    detections, times = detect(Change(), list_sources(models))
-    changed_results = {name: detect(change, list_compared_sources(models)) for name, change in CHANGES.items()}
+    detections, times = detect(Change(), get_sources(models))
+    changed_results = {name: detect(change, get_compared_sources(models)) for name, change in CHANGES.items()}
     return {
         "truth": to_record(to_camera_objects(truth, calibration)),
         "found": detections,
@@ -90,7 +90,7 @@ def measure_detection(frame: Frame, models: Mapping[str, TrainedModel]) -> dict[
 
 
 def detect_with_all(
-    cloud: PointCloud, sources: Mapping[str, Source], height: float, range: str = "auto"
+    cloud: PointCloud, sources: Mapping[str, DetectorSource], height: float, range: str = "auto"
 ) -> dict[str, tuple[Detections, float]]:
     """Run detectors on a cloud. Detectors with equal parameters share the ground and clusters.
 
@@ -126,7 +126,7 @@ def detect_with_all(
 
 
 @lru_cache(maxsize=64)
-def open_network(source: Source, height: float, range: str = "auto") -> NetworkDetector:
+def open_network(source: DetectorSource, height: float, range: str = "auto") -> NetworkDetector:
     """Open a detector that also returns detections with low scores, which average precision needs."""
     kind, _ = resolve_weights(source.weights)
     settings: dict[str, Any] = {f"{kind}.warm_up": False}

@@ -15,19 +15,19 @@ from experiments.clusters.networks import (
     OURS,
     RADII,
     READINGS,
-    list_compared_sources,
-    list_sources,
+    get_compared_sources,
+    get_sources,
     name_model,
 )
 from experiments.framework.experiment import Cell, Row, Section, Table
-from experiments.framework.precision import CELLS, compare_records, draw_cells
+from experiments.framework.precision import CELLS, compare_records, resample_cells
 from experiments.framework.statistics import compute_sampled_p, estimate, make_cells
 from experiments.framework.trained_models import TrainedModel
 from lidar_perception.detectors.pointnet.config import ABLATIONS
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED
 
 REPLICATES = 100
-STRICT_3D, RELAXED_BEV, MEAN = 0, 1, len(CELLS)  # indices into the result of draw_cells()
+STRICT_3D, RELAXED_BEV, MEAN = 0, 1, len(CELLS)  # indices into the result of resample_cells()
 MAX_MS = 100.0  # frame period of KITTI's sensor, for Eq. 1
 MAP = ("mAP 3D [%]", "mAP BEV, relaxed [%]")
 ABOUT_MAP = (
@@ -40,7 +40,7 @@ ABOUT_SHIPPED = (
     "Shipped: the weights of the package, trained for much longer and on other simulated scans, without recorded "
     "scans. They use gamma 0; one row uses the paper's 0.8 (Eq. 9)."
 )
-Draws = Mapping[str, np.ndarray]  # network -> array (1 + R, 2, 10) from draw_cells()
+Draws = Mapping[str, np.ndarray]  # network -> array (1 + R, 2, 10) from resample_cells()
 
 
 def make_detection_sections(
@@ -50,11 +50,11 @@ def make_detection_sections(
     names = [r["frame"] for r in records]
     labels = [r["truth"] for r in records]
     draws = _average_seeds(
-        draw_cells(
+        resample_cells(
             names,
             {
                 model: compare_records(labels, [r["found"][model] for r in records])
-                for model in list_sources(models)
+                for model in get_sources(models)
                 if all(model in r["found"] for r in records)
             },
             REPLICATES,
@@ -62,11 +62,11 @@ def make_detection_sections(
     )
     changed_draws = {
         change: _average_seeds(
-            draw_cells(
+            resample_cells(
                 names,
                 {
                     model: compare_records(labels, [r["changed"][change][model] for r in records])
-                    for model in list_compared_sources(models)
+                    for model in get_compared_sources(models)
                 },
                 REPLICATES,
             )

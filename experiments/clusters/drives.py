@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments.clusters import paper
 from experiments.clusters.detection import detect_with_all
-from experiments.clusters.networks import COMPARED, OURS, list_compared_sources, name_model
+from experiments.clusters.networks import COMPARED, OURS, get_compared_sources, name_model
 from experiments.framework.experiment import Row, Section, Table
 from experiments.framework.statistics import estimate, make_cells
 from experiments.framework.trained_models import TrainedModel
@@ -52,7 +52,7 @@ def measure_drive(
         One dict per key frame with `truth` and `found` (network -> boxes with velocities, see
         to_columns()); None if no drive starts at this frame.
     """
-    sources, drive = list_compared_sources(models), list_drive(frames, number)
+    sources, drive = get_compared_sources(models), list_drive(frames, number)
     if not drive:
         return None
     trackers, rows = {name: Tracker() for name in sources}, []
@@ -61,9 +61,9 @@ def measure_drive(
         for name, (boxes, _) in detect_with_all(frame.load(), sources, frame.sensor_height, "around").items():
             tracks = trackers[name](boxes, frame.stamp_ns, pose)
             result = select_boxes(frame, add_velocities(to_results(boxes, frame), tracks, pose))
-            if result.truth is None or result.scored is None:
+            if result.truth is None or result.detections is None:
                 return None
-            truth, detections[name] = result.truth, to_columns(result.scored)
+            truth, detections[name] = result.truth, to_columns(result.detections)
         rows.append({"truth": to_columns(truth), "found": detections})
     return rows
 

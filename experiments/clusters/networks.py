@@ -15,7 +15,7 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.training.params import PointNetTraining
 
 
-class Source(NamedTuple):
+class DetectorSource(NamedTuple):
     """A detector.
 
     Attributes:
@@ -30,9 +30,9 @@ class Source(NamedTuple):
 OURS = "improved"
 BASELINES = ("pointnet", "pointnet2")
 SHIPPED = {
-    "PointNet, shipped": Source(find_pointnet_weights(PointNetParams())),
-    "PointNet, shipped, gamma 0.8": Source(find_pointnet_weights(PointNetParams()), 0.8),
-    "PointPillars V0, shipped": Source(find_pointpillars_weights(PointPillarsParams(version="v0"))),
+    "PointNet, shipped": DetectorSource(find_pointnet_weights(PointNetParams())),
+    "PointNet, shipped, gamma 0.8": DetectorSource(find_pointnet_weights(PointNetParams()), 0.8),
+    "PointPillars V0, shipped": DetectorSource(find_pointpillars_weights(PointPillarsParams(version="v0"))),
 }
 COMPARED = (OURS, *BASELINES, *SHIPPED)  # compared by difficulty, on modified clouds and on drives
 RADII = {
@@ -64,12 +64,12 @@ def name_model(network: str, seed: int) -> str:
     return network if network in SHIPPED else f"{network}, seed {seed}"
 
 
-def list_sources(models: Mapping[str, TrainedModel]) -> dict[str, Source]:
+def get_sources(models: Mapping[str, TrainedModel]) -> dict[str, DetectorSource]:
     """Return all detectors by their name in the records."""
-    return {**{name: Source(model.weights) for name, model in models.items()}, **SHIPPED}
+    return {**{name: DetectorSource(model.weights) for name, model in models.items()}, **SHIPPED}
 
 
-def list_compared_sources(models: Mapping[str, TrainedModel]) -> dict[str, Source]:
+def get_compared_sources(models: Mapping[str, TrainedModel]) -> dict[str, DetectorSource]:
     """Return the detectors in COMPARED by their name in the records; trained ones with the first seed."""
-    sources = list_sources(models)
+    sources = get_sources(models)
     return {name: sources[name] for name in (name_model(n, 0) for n in COMPARED) if name in sources}

@@ -141,7 +141,7 @@ def count_points(cluster_ids: np.ndarray, ground: np.ndarray, objects: Objects) 
     Returns:
         Values of COUNT_COLUMNS: numbers of compared points, of right points, of right points on
         objects, of points found for an object, of points on objects, of objects, of hits (IoU above
-        0.5), and of clusters that score_clusters() judges; and the sum of the objects' IoU.
+        0.5), and of clusters that score_clusters() scores; and the sum of the objects' IoU.
     """
     is_compared = objects.is_counted & ((objects.owner > 0) | ~ground)
     is_compared &= (objects.owner > 0) == (objects.region > 0)
@@ -161,7 +161,7 @@ def count_points(cluster_ids: np.ndarray, ground: np.ndarray, objects: Objects) 
         int((owner > 0).sum()),
         int(has_points.sum()),
         int((score.iou[has_points] > 0.5).sum()),
-        score.judged_count,
+        score.scored_count,
         round(float(score.iou[has_points].sum()), 6),
     ]
 

@@ -9,7 +9,13 @@ from pathlib import Path
 import click
 
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import ScoringOptions, intervals_option, no_labels_error, path_option, scoring_options
+from lidar_perception.cli.data import (
+    ScoringOptions,
+    intervals_option,
+    make_no_labels_error,
+    path_option,
+    scoring_options,
+)
 from lidar_perception.cli.options import (
     Algorithm,
     Settings,
@@ -78,7 +84,7 @@ def compare(
     report = ComparisonReport(contenders, intervals, recording.is_sequential)
     options.fill(report, recording, partial(start_comparison, open_function), title="comparing")
     if not report.first.frames:
-        raise no_labels_error(recording, report.skipped)
+        raise make_no_labels_error(recording, report.skipped)
     centres = report.first.pedestrians.compute()
     content = {
         "source": str(options.data),

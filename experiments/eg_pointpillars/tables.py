@@ -11,7 +11,7 @@ from experiments.eg_pointpillars import paper
 from experiments.eg_pointpillars.diagonals import make_diagonal_section
 from experiments.eg_pointpillars.models import ALL_FRACTIONS, COMPARED_VERSIONS, group_seeds
 from experiments.framework.experiment import Cell, Figure, Panel, Row, Section, Table
-from experiments.framework.precision import CELLS, compare_records, draw_cells, from_record
+from experiments.framework.precision import CELLS, compare_records, from_record, resample_cells
 from experiments.framework.statistics import compute_sampled_p, estimate, make_cells, make_line, nan_to_none
 from experiments.framework.trained_models import TrainedModel
 from lidar_perception.detectors.pointpillars.config import VERSIONS
@@ -30,7 +30,7 @@ Draws = dict[tuple[str, float], np.ndarray]  # (version, fraction of the labels)
 def make_sections(records: list[dict[str, Any]], models: Mapping[str, TrainedModel]) -> list[Section]:
     """Make the report for networks that the experiment has trained, from the records of measure_frame()."""
     records = _drop_skipped(records)
-    model_draws = draw_models(records, models)
+    model_draws = resample_models(records, models)
     draws = average_seeds(model_draws, models)
     return [
         make_training_section(models),
@@ -49,7 +49,7 @@ def make_shipped_sections(records: list[dict[str, Any]], models: Mapping[str, Tr
         "research log), so a difference between two versions is not only the effect of the experts. "
         "No network was trained on a real scan."
     )
-    draws = average_seeds(draw_models(records, models), models)
+    draws = average_seeds(resample_models(records, models), models)
     return [Section("What is measured", text), *make_version_sections(draws, records, models)]
 
 
@@ -64,15 +64,15 @@ def make_version_sections(
     ]
 
 
-def draw_models(records: list[dict[str, Any]], models: Mapping[str, TrainedModel]) -> dict[str, np.ndarray]:
-    """Compute the average precision of each network for samples of the frames, see draw_cells()."""
+def resample_models(records: list[dict[str, Any]], models: Mapping[str, TrainedModel]) -> dict[str, np.ndarray]:
+    """Compute the average precision of each network for samples of the frames, see resample_cells()."""
     labels = [record["true"] for record in records]
     frames_by_model = {name: compare_records(labels, [record["found"][name] for record in records]) for name in models}
-    return draw_cells([record["frame"] for record in records], frames_by_model)
+    return resample_cells([record["frame"] for record in records], frames_by_model)
 
 
 def average_seeds(model_draws: Mapping[str, np.ndarray], models: Mapping[str, TrainedModel]) -> Draws:
-    """Average the result of draw_models() over seeds."""
+    """Average the result of resample_models() over seeds."""
     return {key: np.mean([model_draws[name] for name in group], axis=0) for key, group in group_seeds(models).items()}
 
 

@@ -94,7 +94,7 @@ def compute_cells(frames: list[ComparedFrame]) -> np.ndarray:
     return cells
 
 
-def draw_cells(
+def resample_cells(
     names: Sequence[str], detectors: Mapping[str, list[ComparedFrame]], replicates: int = REPLICATES
 ) -> dict[str, np.ndarray]:
     """Compute the cells of each detector for all frames and for random samples of the frames.

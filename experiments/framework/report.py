@@ -160,10 +160,10 @@ def to_markdown(
 
 
 def _format_rows(header, rows) -> list[str]:
-    def line(row) -> str:
+    def format_row(row) -> str:
         return "| " + " | ".join(text.replace("|", r"\|") for text in row) + " |"
 
-    return [line(header), "|" + "---|" * len(header), *map(line, rows)]
+    return [format_row(header), "|" + "---|" * len(header), *map(format_row, rows)]
 
 
 def _format_inline(cell: str | Cell) -> str:

@@ -73,7 +73,7 @@ class ScanMeasurements:
         """
         scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
         protocol = set_sensor_height(protocol, frame.sensor_height)
-        # The points are sorted because the trial planes of the ground threshold depend on their order.
+        # Sort the points, because the trial planes of the ground threshold depend on their order.
         scan = scan.take(np.lexsort(scan.xyz.T))
         frame = Frame.of(frame.name, scan, truth, calibration)
         self.scans += 1

@@ -26,7 +26,8 @@ from lidar_perception.types import GroundTruth, PointCloud
 
 CLASSES = tuple(DETECTED)
 PERSON_HEIGHT = 1.7  # seed height in metres for the height filter in stage 1 of the STM-CPA paper
-SECTORS, MIN_SECTORS = 36, 27  # a scan with points in fewer of the sectors of a revolution is cropped to a view
+SECTORS = 36  # number of sectors of a revolution
+MIN_SECTORS = 27  # a scan with points in fewer sectors is cropped to the camera's view
 MIN_POINTS = 5  # minimum number of points to measure an object's extent or intensity
 MIN_BIN_POINTS = 50  # minimum number of points in a range bin to measure its ground fraction
 MAX_QUERIES, MIN_QUERIES = 600, 10  # number of points in a range bin whose neighbours are measured
@@ -36,7 +37,7 @@ ELEVATIONS = np.arange(-26.0, 4.1, 2.0)
 QUANTILES = (5, 25, 50, 75, 95)
 INTENSITY_STEP = 0.01
 ROUGH_STEP_M = 0.002  # smaller differences in roughness are ignored
-BELT_HEIGHT = 0.65  # fraction of an object's height above which a car has windows
+BELT_HEIGHT = 0.65  # height of the lower edge of a car's windows, as a fraction of its height
 CAR_NAME = CLASSES[CAR]
 CAR_FROM = f"{CAR_NAME} from "
 # Directions from which a sensor sees only one face of a car, in degrees from its front.

@@ -52,7 +52,7 @@ class ScoredBoxes(NamedTuple):
     threshold: float
 
     @property
-    def accepted(self) -> np.ndarray:
+    def accepted_boxes(self) -> np.ndarray:
         """Boxes (A, 7) whose score reaches the threshold."""
         return self.boxes[self.scores >= self.threshold]
 
@@ -90,7 +90,7 @@ def score_boxes(candidates: ScoredBoxes, truth: np.ndarray) -> dict[str, list]:
         `ranked`, with [score, 1 for a hit or 0] of every candidate. For `ranked`, candidates are
         matched regardless of their scores, so that each pedestrian has at most one hit.
     """
-    boxes = candidates.accepted
+    boxes = candidates.accepted_boxes
     counts = count_by_range(boxes, truth, match_centres(boxes, truth))
     is_hit = np.isin(np.arange(len(candidates.boxes)), match_centres(candidates.boxes, truth)[0])
     return {

@@ -60,7 +60,7 @@ class Command(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         for param in self.params:
-            if isinstance(param, HelpfulOption) and param.asks_for_help(args):
+            if isinstance(param, OptionWithHelp) and param.is_help_requested(args):
                 ctx.resilient_parsing = True  # allows required options to be missing
                 super().parse_args(ctx, [*args])
                 click.echo(param.list_values(ctx.params))
@@ -78,7 +78,7 @@ class Command(click.Command):
             raise click.UsageError(f"no such option {error.option_name}{remedy}", ctx) from None
 
 
-class HelpfulOption(click.Option):
+class OptionWithHelp(click.Option):
     """An option whose possible values are listed by `--NAME help`.
 
     Args:
@@ -89,7 +89,7 @@ class HelpfulOption(click.Option):
         super().__init__(*args, **kwargs)
         self.list_values = list_values
 
-    def asks_for_help(self, args: list[str]) -> bool:
+    def is_help_requested(self, args: list[str]) -> bool:
         """Return True if the command line asks for the listing."""
         return any(
             f"{flag}=help" in args or [flag, "help"] in [args[i : i + 2] for i in range(len(args))]

@@ -32,7 +32,7 @@ def path_option(name: str, description: str, metavar: str = "FILE", **option_arg
 
 
 class OutFile(click.Path):
-    """Path of a file that a command writes at its end. Checks at the start that it can be written."""
+    """Path of a file that a command will write. It is refused at the start if it is not writable."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
@@ -48,7 +48,7 @@ def out_file_option(name: str, description: str, *aliases: str, **option_args: A
 
 
 class OutFolder(click.Path):
-    """Folder to write into. Checks at the start that it is writable; it is created when something is written."""
+    """Folder that a command will write into, which need not exist. It is refused at the start if not writable."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
@@ -157,7 +157,7 @@ intervals_option = click.option(
     default=0,
     metavar="N",
     help="Also print bootstrap intervals from N resamples of the "
-    "drives, or of runs of 10 frames where there are few drives. 200 are enough.",
+    "drives, or of blocks of 10 frames if there are few drives. 200 resamples are enough.",
 )
 port_option = click.option(
     "--port", type=click.IntRange(0, 65535), default=0, show_default=True, help="Port on 127.0.0.1; 0: any free port."
@@ -296,7 +296,7 @@ def write_json(path: Path | None, content: dict) -> None:
         write_text(path, json.dumps(content, indent=1))
 
 
-def no_labels_error(recording: Any, skipped: list[str], requirement: str = "labels") -> InputError:
+def make_no_labels_error(recording: Any, skipped: list[str], requirement: str = "labels") -> InputError:
     """Return the error for a run without scored frames, with the reason for the first frame."""
     reason = f" ({skipped[0]})" if skipped else ""
     return InputError(f"{recording.path}: no frame with {requirement}{reason}")

@@ -183,7 +183,7 @@ def demo(
         next(iter(replayed_bag)).sensor_height,
     )
     console.print(f"results in {out}: result (bag), scores.json, logs" + (", birdseye.png" if has_picture else ""))
-    console.print(f"show it: lidar-perception view {out / 'result'}")
+    console.print(f"to view it: lidar-perception view {out / 'result'}")
     if missing_count := clouds - content["results"]:
         errors.print(
             Text(f"{missing_count} clouds produced no result", "red")
@@ -268,7 +268,7 @@ def _print_detections(frames: Sequence[RecordedResult], calibration: Any) -> dic
     report = DetectionReport()
     for frame in frames:
         report.update(
-            FrameDetections(str(frame.stamp_ns), to_truth(frame.truth), to_detections(frame.published), calibration)
+            FrameDetections(str(frame.stamp_ns), to_truth(frame.truth), to_detections(frame.objects), calibration)
         )
     scores = score_at_threshold(report.frames)
     print_scores_at_threshold(scores, len(frames), console)
@@ -321,7 +321,7 @@ def _print_tracks(frames: Sequence[RecordedResult], calibration: Any, poses: str
 def _select_drawn_objects(frames: Sequence[RecordedResult], detector: str) -> dict[int, tuple[np.ndarray, Any]]:
     """Return {stamp: (labelled boxes, detected objects)}, with the classes that the detector supports."""
     names = {CLASSES[PEDESTRIAN]} if detector == CANDIDATES else {*DETECTED}
-    return {f.stamp_ns: (f.truth.boxes[[label in names for label in f.truth.labels]], f.published) for f in frames}
+    return {f.stamp_ns: (f.truth.boxes[[label in names for label in f.truth.labels]], f.objects) for f in frames}
 
 
 def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]], height: float) -> bool:
@@ -338,7 +338,7 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
     }
     if not counts:
         return False
-    best_stamp = max(counts, key=lambda s: (counts[s], s))  # the last such frame, because its trails are the longest
+    best_stamp = max(counts, key=lambda s: (counts[s], s))  # of equal frames the last one, whose trails are the longest
     truth, detections = frames[best_stamp]
     trails: dict[int, np.ndarray] = {}
     cloud_msg = None

@@ -141,7 +141,7 @@ def detect(
       lidar-perception detect drive.bag --track --range around --format mcap --out results
       lidar-perception detect drive.bag --track --out results --video drive.mp4
     """
-    from lidar_perception.detecting.bag import Bag
+    from lidar_perception.detecting.bag import BagFormat
     from lidar_perception.detecting.formats import FORMATS as WRITERS
     from lidar_perception.detecting.formats import Run
     from lidar_perception.detecting.pictures import FrameDrawer, PictureWriter, VideoWriter
@@ -185,7 +185,7 @@ def detect(
     run = Run(recording, out, header, count)
     drawer = FrameDrawer(run, color)
     writer_factories: list[Any] = [
-        partial(Bag, with_clouds=clouds, with_tracks=track) if name == "mcap" else WRITERS[name]
+        partial(BagFormat, with_clouds=clouds, with_tracks=track) if name == "mcap" else WRITERS[name]
         for name in format_names
     ]
     writer_factories += [partial(PictureWriter, drawer=drawer)] if png else []

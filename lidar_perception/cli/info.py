@@ -123,6 +123,6 @@ def _print_recording(content: dict[str, Any]) -> None:
         intensity += f" (0 .. {first['full_intensity']:g} in the files, read as 0 .. 1)"
     console.print(f"first cloud: {first['name']}, {first['points']} points, {intensity}")
     if first["labels"] is not None:
-        console.print(f"its labels: {', '.join(first['labels']) or 'none'}")
+        console.print(f"labels of the first cloud: {', '.join(first['labels']) or 'none'}")
     for line in content["lost_labels"]:
         console.print(line)

@@ -16,7 +16,7 @@ from typing import Any
 import click
 
 from lidar_perception.candidates.configurations import CONFIGURATIONS, PAPER
-from lidar_perception.cli.command import Choice, HelpfulOption
+from lidar_perception.cli.command import Choice, OptionWithHelp
 from lidar_perception.cli.parameter_files import Fields, parse_value, read_parameters
 from lidar_perception.detectors.contract import FUSED
 from lidar_perception.detectors.open import DetectorChoice, make_default_params
@@ -148,7 +148,7 @@ def settings_options(
         wrapper = click.option(
             "--set",
             "assignments",
-            cls=HelpfulOption,
+            cls=OptionWithHelp,
             list_values=list_parameters,
             multiple=True,
             type=Assignment(),
@@ -339,7 +339,7 @@ def detectors_options(function: Callable) -> Callable:
 def make_detector_choice(
     weights: str | Path, range: str, device: str, values: Mapping[str, Any], params: Any = None
 ) -> DetectorChoice:
-    """Return the choice of a detector, which is opened later. Its parameters are validated now.
+    """Return a DetectorChoice with validated parameters. The detector is opened later.
 
     Args:
         params: default parameters of a detector that open_detector does not support.

@@ -75,7 +75,7 @@ from lidar_perception.types import InputError
     type=click.FloatRange(0, MAX_PEOPLE),
     default=1.0,
     show_default=True,
-    help="Number of pedestrians and cyclists relative to the default (on streets: that of KITTI).",
+    help="Number of pedestrians and cyclists relative to the default, which on streets is as many as in KITTI.",
 )
 @click.option(
     "--streets-of",

@@ -20,7 +20,7 @@ from lidar_perception.wire.track_markers import make_track_rows
 from msg_utils.markers import MarkerRow, list_marker_keys
 
 
-class Bag:
+class BagFormat:
     """Output format that writes the results of a run to the bag bag/.
 
     The bag contains detections, optionally tracks and clouds, and the recording's labels, camera
@@ -60,7 +60,7 @@ class Bag:
         try:
             content = self.writer.read(frame)
         except InputError:
-            try:  # without the labels, which may be the reason for the error
+            try:  # again without the labels, which may have caused the error
                 content = self.writer.read(replace(frame, truth=return_none))
             except InputError as error:
                 self.run.skipped.append(f"not in {self.path}: {error}")

@@ -150,7 +150,7 @@ class Kitti(BufferedFormat):
     def finish(self) -> None:
         for drive, frames in self.drives.items():
             name = self.names[drive]
-            first_number = 0 if name == drive else frames[0][0]  # unnamed drives start at 0
+            first_number = 0 if name == drive else frames[0][0]  # frames of unnamed drives are numbered from 0
             write_tracking_results(
                 self.path / f"{name}.txt",
                 [(number - first_number, ids, detections) for number, ids, detections in frames],

@@ -18,7 +18,7 @@ class RecordedResult:
 
     stamp_ns: int
     truth: MarkedObjects
-    published: MarkedObjects
+    objects: MarkedObjects
 
 
 def read_results(path: Path, *topics: str) -> list[list[RecordedResult]]:

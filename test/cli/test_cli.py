@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from click.testing import CliRunner
 from mcap.writer import Writer
 from samples import LABELS, WALKER, make_lowered_crowd, make_walker_label, write_file, write_object_folder
 
+from experiments.__main__ import cli as experiments_cli
 from lidar_perception.cli import info
 from lidar_perception.cli.data import open_and_describe
 from lidar_perception.cli.demo import _load_node_params, _open_replayed_bag
@@ -51,6 +53,18 @@ LEAVES = commands(cli)
 def test_help_of_every_command_has_an_example(words):
     text = run_command(*words, "--help")
     assert "Usage: " in text and "Example" in text and f"lidar-perception {' '.join(words)}" in text
+
+
+@pytest.mark.parametrize("group, program", [(cli, "lidar-perception"), (experiments_cli, "./lidar")])
+def test_examples_use_options_that_exist(group, program):
+    leaves = {words: command for words, command in commands(group) if words != ("run",)}  # run passes its options on
+    helps = "\n".join(command.help for command in (group, *leaves.values())).replace("\\\n", " ")
+    examples = [line.split() for line in re.findall(rf"{re.escape(program)} (.*)", helps)]
+    for words, command in leaves.items():
+        options = {name for param in command.params for name in (*param.opts, *param.secondary_opts)}
+        for example in examples:
+            if tuple(example[: len(words)]) == words:
+                assert {word.split("=")[0] for word in example if word.startswith("--")} <= options, example
 
 
 def test_overview_shows_every_command():

@@ -21,7 +21,7 @@ from lidar_perception.data.kitti.labels import read_tracking_labels
 from lidar_perception.data.kitti.results import choose_calibration, read_results
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
-from lidar_perception.detecting.bag import Bag as BagFormat
+from lidar_perception.detecting.bag import BagFormat
 from lidar_perception.detecting.formats import Json
 from lidar_perception.detecting.run import detect as run_detector
 from lidar_perception.detectors.contract import DetectionResult

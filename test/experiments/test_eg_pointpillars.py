@@ -18,7 +18,14 @@ from experiments.eg_pointpillars.measure import NO_CLASS, measure_diagonals
 from experiments.eg_pointpillars.models import choose_models
 from experiments.eg_pointpillars.pictures import count_errors
 from experiments.framework.experiment import Cell
-from experiments.framework.precision import CELLS, compare_records, compute_cells, draw_cells, from_record, to_record
+from experiments.framework.precision import (
+    CELLS,
+    compare_records,
+    compute_cells,
+    from_record,
+    resample_cells,
+    to_record,
+)
 from experiments.framework.statistics import compute_sampled_p, estimate
 from experiments.framework.trained_models import TrainedModel
 from lidar_perception.camera import Calibration
@@ -66,7 +73,7 @@ def test_table_cells_equal_scores_of_paired_samples():
     car = [i for i, (name, _) in enumerate(CELLS) if name == "Car"]
     np.testing.assert_allclose(cells[:, car[1:]], 100)
     assert np.isnan(np.delete(cells[:, :-1], car, axis=1)).all()  # no objects of these classes
-    draws = draw_cells([f"{i}" for i in range(12)], {"a": frames, "b": compare_records(true, half)}, replicates=20)
+    draws = resample_cells([f"{i}" for i in range(12)], {"a": frames, "b": compare_records(true, half)}, replicates=20)
     gain = (draws["a"] - draws["b"])[:, 0, -1]
     assert gain[0] > 30 and compute_sampled_p(gain) == pytest.approx(2 / 21)
     assert compute_sampled_p(np.zeros(21)) == 1.0
@@ -97,7 +104,7 @@ def test_report_has_paper_values_and_every_label_fraction():
     }
     records = [{"frame": f"{i}", **record} for i in range(3)] + [{"frame": "x", "skipped": "bad"}]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tables, "draw_cells", partial(draw_cells, replicates=4))
+        patch.setattr(tables, "resample_cells", partial(resample_cells, replicates=4))
         sections = tables.make_sections(records, models)
         tables.make_sections([], models)  # an unfinished run has no records
         some = {name: m for name, m in models.items() if m.model.label_share == 1.0}
@@ -175,7 +182,7 @@ def test_tiny_run_from_training_to_pictures(tmp_path, monkeypatch):
             fpn_channels=4,
         ),
     )
-    monkeypatch.setattr(tables, "draw_cells", partial(draw_cells, replicates=2))
+    monkeypatch.setattr(tables, "resample_cells", partial(resample_cells, replicates=2))
     sets = {
         "sensor": "generic:16,-20,5,2,10",
         "data.scans": 4,

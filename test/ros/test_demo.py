@@ -46,7 +46,7 @@ def test_demo_scores_like_offline_in_one_or_many_processes(drive_bag, make_bag, 
         (found,) = read_results(out / "result", list_result_topics(False, "fused")[FINAL_STAGE])
         assert {f.stamp_ns for f in found} == frames.keys() and scores["results"] == len(frames)
         for answer in found:
-            assert_equal(answer.published, expected[answer.stamp_ns])
+            assert_equal(answer.objects, expected[answer.stamp_ns])
         people = scores["detections"]["Pedestrian"]
         assert people["hits"] > 0 and people["hits"] + people["missed"] == people["labels"]
         assert scores["tracks"]["scores"]["Pedestrian"]["hits"] > 0

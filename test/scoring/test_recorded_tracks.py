@@ -63,9 +63,7 @@ def test_recorded_tracks_need_labels_with_ids(recorded_tracks):
         assert (scores["true_tracks"], scores["switches"]) == (3, 0) and scores["HOTA"] > 0.8
         later = [
             replace(
-                f,
-                stamp_ns=f.stamp_ns + 600 * TENTH,
-                published=replace(f.published, ids=np.asarray(f.published.ids) + 100),
+                f, stamp_ns=f.stamp_ns + 600 * TENTH, objects=replace(f.objects, ids=np.asarray(f.objects.ids) + 100)
             )
             for f in frames
         ]

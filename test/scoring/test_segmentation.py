@@ -131,7 +131,7 @@ def test_neutral_points_count_for_other_objects():
 def test_clusters_of_ignored_points_are_not_scored(counted):
     """Most points of a frame can be unlabelled."""
     truth = make_objects(np.repeat([1, 0, 2], 10), near=np.ones(30), counted=np.arange(30) < counted)
-    assert score_clusters(np.repeat([1, 2, 3], 10), truth).judged_count == counted / 10
+    assert score_clusters(np.repeat([1, 2, 3], 10), truth).scored_count == counted / 10
 
 
 @given(seeds)
@@ -165,8 +165,8 @@ def test_scores_equal_a_plain_loop_over_sets(seed):
             c in pieces[k] and any(c in p for j, p in enumerate(pieces) if j != k) for c in best
         )
     near = set(np.flatnonzero(truth.is_near))
-    assert score.judged_count == sum(2 * len(s & near) > len(s) for s in sets.values())
-    assert score.judged_count >= np.sum(score.iou > 0.5)  # so that ratios are at most 1
+    assert score.scored_count == sum(2 * len(s & near) > len(s) for s in sets.values())
+    assert score.scored_count >= np.sum(score.iou > 0.5)  # so that ratios are at most 1
 
 
 def test_scores_are_defined_without_clusters_or_objects():

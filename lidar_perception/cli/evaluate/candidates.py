@@ -10,7 +10,7 @@ import click
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import ScoringOptions, no_labels_error, scoring_options, with_recorded_height
+from lidar_perception.cli.data import ScoringOptions, make_no_labels_error, scoring_options, with_recorded_height
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.terminal import console, errors
@@ -55,7 +55,7 @@ def candidates(options: ScoringOptions, params: PipelineParams) -> None:
     report = CandidateReport()
     options.fill(report, recording, partial(measure_candidates, params))
     if report.frames == 0:
-        raise no_labels_error(recording, report.skipped, "a Pedestrian label")
+        raise make_no_labels_error(recording, report.skipped, "a Pedestrian label")
     content = report.compute()
     print_candidate_report(content, console)
     options.write(content)

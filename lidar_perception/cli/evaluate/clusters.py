@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import ScoringOptions, no_labels_error, path_option, scoring_options
+from lidar_perception.cli.data import ScoringOptions, make_no_labels_error, path_option, scoring_options
 from lidar_perception.cli.options import Algorithm, Settings, apply_values, settings_options
 from lidar_perception.detectors.open import POINTNET, make_default_params, resolve_weights
 from lidar_perception.detectors.weights_file import POINTNET_WEIGHTS
@@ -65,7 +65,7 @@ def clusters(options: ScoringOptions, weights: Path | None, settings: Settings) 
     recording = options.open_recording(BOXES)
     options.fill(scores, recording, partial(measure_network, file, values))
     if not scores.frames:
-        raise no_labels_error(recording, scores.skipped)
+        raise make_no_labels_error(recording, scores.skipped)
     content = {"source": str(weights or "the package's own"), **scores.compute()}
     print_cluster_scores(content, console)
     options.write(content)

@@ -13,8 +13,8 @@ from lidar_perception.cli.command import Command, refuse_options
 from lidar_perception.cli.data import (
     ScoringOptions,
     intervals_option,
+    make_no_labels_error,
     mount_height_option,
-    no_labels_error,
     out_folder_option,
     path_option,
     scoring_options,
@@ -139,8 +139,8 @@ def _print_scores(content: dict[str, Any]) -> None:
     type=click.FloatRange(0, 1),
     default=MIN_SCORE,
     show_default=True,
-    help="Minimum score of boxes of --weights. Average precision needs weak boxes too, so keep this below a robot's "
-    "threshold.",
+    help="Minimum score of boxes of --weights. Average precision needs boxes with low scores too, so keep this below "
+    "the threshold that is used on the robot.",
 )
 @click.option(
     "--keep",
@@ -182,7 +182,7 @@ def detection(options: ScoringOptions, **choices: Any) -> None:
     if request.write_results is not None:
         console.print(f"result files: {request.write_results}")
     if not report.frames and (request.write_results is None or report.skipped):
-        raise no_labels_error(recording, report.skipped)
+        raise make_no_labels_error(recording, report.skipped)
     content = request.compute(report)
     if report.frames:
         _print_scores(content)

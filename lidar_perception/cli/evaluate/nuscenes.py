@@ -10,7 +10,13 @@ from typing import Any
 import click
 
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import ScoringOptions, no_labels_error, out_file_option, path_option, scoring_options
+from lidar_perception.cli.data import (
+    ScoringOptions,
+    make_no_labels_error,
+    out_file_option,
+    path_option,
+    scoring_options,
+)
 from lidar_perception.cli.options import detector_options
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.detectors.params import MIN_SCORE
@@ -95,7 +101,7 @@ def nuscenes(options: ScoringOptions, **choices: Any) -> None:
         write_results(request.write_results, report.boxes)
         console.print(f"result file: {request.write_results}")
     if not report.frames and (request.write_results is None or report.skipped):
-        raise no_labels_error(recording, report.skipped)
+        raise make_no_labels_error(recording, report.skipped)
     content = {"source": request.source, "version": recording.layout.split()[-1], **report.compute()}
     if report.frames:
         print_nuscenes_report(content, console)

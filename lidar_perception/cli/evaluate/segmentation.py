@@ -12,7 +12,7 @@ from lidar_perception.cli.data import (
     DATA_HELP,
     ScoringOptions,
     data_argument,
-    no_labels_error,
+    make_no_labels_error,
     scoring_options,
     with_recorded_height,
 )
@@ -89,7 +89,7 @@ def segmentation(options: ScoringOptions, methods: tuple, params: SegmentationPa
             recording.layout,
         )
     if not (report.ground or report.clusters):
-        raise no_labels_error(recordings[0], report.skipped)
+        raise make_no_labels_error(recordings[0], report.skipped)
     content = report.compute()
     if report.without_camera:
         errors.print(

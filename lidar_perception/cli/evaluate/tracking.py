@@ -8,7 +8,7 @@ import click
 from rich.text import Text
 
 from lidar_perception.cli.command import Choice, Command
-from lidar_perception.cli.data import ScoringOptions, no_labels_error, scoring_options
+from lidar_perception.cli.data import ScoringOptions, make_no_labels_error, scoring_options
 from lidar_perception.cli.options import detector_options
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.runs.terminal import console
@@ -55,7 +55,7 @@ def tracking(options: ScoringOptions, detector: DetectorChoice, tracking: Tracki
         )
     options.fill(report, recording, partial(measure_tracking, open_detector, tracking, source))
     if not report.frames:
-        raise no_labels_error(recording, report.skipped)
+        raise make_no_labels_error(recording, report.skipped)
     content = {"source": detector.weights, "ego": source, **report.compute()}
     print_tracking_report(content, console)
     options.write(content)

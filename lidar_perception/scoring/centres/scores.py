@@ -35,7 +35,7 @@ class CentreScores:
             self.names.append(name)
 
     def find_best_score(self) -> float | None:
-        """Return the score threshold with the best F1 (the highest of several), None without detections."""
+        """Return the score threshold with the best F1 (the highest one in a tie), None without detections."""
         score_parts, hit_parts = [np.zeros(0)], [np.zeros(0, int)]
         for truth, boxes, frame_scores in self.frames:
             hit_counts = [len(match_centres(boxes[:n], truth)[0]) for n in range(len(boxes) + 1)]

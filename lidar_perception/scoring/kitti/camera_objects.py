@@ -94,7 +94,7 @@ def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> 
             "fix the detector or the result file"
         )
     if calibration is None:
-        return _make_without_camera(objects, scores[: len(objects)])
+        return _make_objects_without_camera(objects, scores[: len(objects)])
     labels = to_labels(objects, calibration.lidar_to_camera)
     projected_boxes, outside_fractions = np.zeros((len(labels), 4)), np.zeros(len(labels))
     pixels, outside_fractions[: len(objects)] = project_boxes(objects.boxes, calibration)
@@ -133,7 +133,7 @@ def select_in_image(truth: GroundTruth, calibration: Calibration | None) -> Grou
     return truth.take(to_camera_objects(truth, calibration).pixels_high[: len(truth)] > 0)
 
 
-def _make_without_camera(objects: GroundTruth, scores: np.ndarray) -> CameraObjects:
+def _make_objects_without_camera(objects: GroundTruth, scores: np.ndarray) -> CameraObjects:
     count = len(objects)
     return CameraObjects(
         objects.class_ids,

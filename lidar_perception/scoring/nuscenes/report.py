@@ -28,7 +28,7 @@ class KeyFrameResult:
         token: Sample token.
         boxes: All detected boxes, as in a result file.
         truth: Scored labels, None if the frame has no labels.
-        scored: Scored detections, None if the frame has no labels.
+        detections: Scored detections, None if the frame has no labels.
         ms: Run time of the detector, None for result files.
         problem: Reason why the detector rejected the frame, or None.
     """
@@ -36,7 +36,7 @@ class KeyFrameResult:
     token: str
     boxes: GlobalBoxes
     truth: GlobalBoxes | None
-    scored: GlobalBoxes | None
+    detections: GlobalBoxes | None
     ms: float | None = None
     problem: str | None = None
 
@@ -126,9 +126,9 @@ class NuscenesReport:
             self.skipped.append(result.problem)
         if result.ms is not None:
             self.ms.append(result.ms)
-        if result.truth is not None and result.scored is not None:
+        if result.truth is not None and result.detections is not None:
             self.truth.append(result.truth)
-            self.detections.append(result.scored)
+            self.detections.append(result.detections)
 
     def compute(self) -> dict:
         """Return the content of the JSON file. ap, map and nds are in percent.

@@ -29,9 +29,9 @@ LOW_VEGETATION_Z = -1.3  # maximum z of ground in metres, in KITTI's LiDAR frame
 
 HIT_IOU = 0.5
 MIN_POINTS = 10  # minimum number of points of an object; others are ignored
-BOTTOM_MARGIN = 0.2  # height above the bottom of a box in metres below which points may be road
+BOTTOM_MARGIN = 0.2  # points up to this height in metres above the bottom of a box may belong to the road
 BOX_MARGIN = 0.2  # margin of boxes in metres; a cluster is scored if most of its points are in enlarged boxes
-MIN_PIECE_FRACTION = 0.1  # minimum fraction of an object's points in a cluster that is a piece of it
+MIN_PIECE_FRACTION = 0.1  # a cluster with at least this fraction of an object's points is a piece of the object
 RANGE_NAMES = ("0-15", "15-30", "30-45", "45+")
 RANGE_LIMITS = np.array([15.0, 30.0, 45.0])
 
@@ -189,14 +189,14 @@ class ClusterScore:
         pieces: (K,) number of clusters with at least MIN_PIECE_FRACTION of the object's points.
         is_shared: (K,) bool, True if the best cluster also contains a piece of another object.
         cluster_count: Number of clusters.
-        judged_count: Number of clusters with most of their points near objects, which are scored.
+        scored_count: Number of clusters with most of their points near objects, which are scored.
     """
 
     iou: np.ndarray
     pieces: np.ndarray
     is_shared: np.ndarray
     cluster_count: int
-    judged_count: int
+    scored_count: int
 
 
 def score_clusters(cluster_ids: np.ndarray, objects: Objects) -> ClusterScore:
@@ -233,13 +233,13 @@ def score_clusters(cluster_ids: np.ndarray, objects: Objects) -> ClusterScore:
         )
         > 0
     )
-    is_judged = 2 * np.bincount(ids, is_near, minlength=len(size))[1:] > size[1:]
+    is_scored = 2 * np.bincount(ids, is_near, minlength=len(size))[1:] > size[1:]
     return ClusterScore(
         best_iou[1:],
         np.bincount(object_index[is_piece], minlength=rows)[1:],
         is_shared[1:],
         len(numbers),
-        int(is_judged.sum()),
+        int(is_scored.sum()),
     )
 
 
@@ -256,7 +256,7 @@ class ClusterReport:
         self.ms.append(ms)
 
     def compute(self) -> dict:
-        """Return the content of the JSON file. Precision is the fraction of judged clusters that are hits."""
+        """Return the content of the JSON file. Precision is the fraction of scored clusters that are hits."""
         classes = np.array([c for names, _, _ in self.frames for c in names], str)
         ranges = _concatenate(frame_ranges for _, frame_ranges, _ in self.frames)
         bins = np.searchsorted(RANGE_LIMITS, ranges, "right")
@@ -265,17 +265,17 @@ class ClusterReport:
         ]
         overall = _to_object_row(*columns)
         clusters = sum(score.cluster_count for _, _, score in self.frames)
-        judged_clusters = sum(score.judged_count for _, _, score in self.frames)
+        scored_clusters = sum(score.scored_count for _, _, score in self.frames)
         hits = overall["hits"]
         return {
             "frames": len(self.frames),
             "ms": _compute_median(self.ms),
             "clusters": clusters,
             "clusters_per_frame": _divide(clusters, len(self.frames)),
-            "judged_clusters": judged_clusters,
+            "judged_clusters": scored_clusters,
             **overall,
-            "precision": _divide(hits, judged_clusters),
-            "f1": _divide(2 * hits, judged_clusters + overall["objects"]),
+            "precision": _divide(hits, scored_clusters),
+            "f1": _divide(2 * hits, scored_clusters + overall["objects"]),
             "by_class": {
                 str(name): _to_object_row(*(c[classes == name] for c in columns)) for name in np.unique(classes)
             },

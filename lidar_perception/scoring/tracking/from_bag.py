@@ -19,7 +19,7 @@ def count_recorded_tracks(frames: Sequence[RecordedResult]) -> dict[str, int]:
     """Count the recorded tracks by class."""
     ids: dict[str, set[int]] = {}
     for frame in frames:
-        for i, label in zip(frame.published.ids.tolist(), frame.published.labels):
+        for i, label in zip(frame.objects.ids.tolist(), frame.objects.labels):
             ids.setdefault(label, set()).add(i)
     return {name: len(ids[name]) for name in sorted(ids)}
 
@@ -41,7 +41,7 @@ def score_recorded_tracks(
                 f"drive {drive}",
                 i,
                 to_truth(frame.truth),
-                to_tracked_labels(np.asarray(frame.published.ids), to_detections(frame.published)),
+                to_tracked_labels(np.asarray(frame.objects.ids), to_detections(frame.objects)),
                 calibration,
             )
         )

@@ -14,7 +14,7 @@ from lidar_perception.scoring.tracking.pairs import EPS, Pairs, find_best_pairs
 ALPHAS = np.arange(0.05, 0.99, 0.05)  # 19 similarity thresholds
 
 
-def _zeros() -> np.ndarray:
+def _make_zeros() -> np.ndarray:
     return np.zeros(len(ALPHAS))
 
 
@@ -30,11 +30,11 @@ class HotaCounts:
         similarity: Sum of the similarities of the true positives.
     """
 
-    tp: np.ndarray = field(default_factory=_zeros)
-    fn: np.ndarray = field(default_factory=_zeros)
-    fp: np.ndarray = field(default_factory=_zeros)
-    association: np.ndarray = field(default_factory=_zeros)
-    similarity: np.ndarray = field(default_factory=_zeros)
+    tp: np.ndarray = field(default_factory=_make_zeros)
+    fn: np.ndarray = field(default_factory=_make_zeros)
+    fp: np.ndarray = field(default_factory=_make_zeros)
+    association: np.ndarray = field(default_factory=_make_zeros)
+    similarity: np.ndarray = field(default_factory=_make_zeros)
 
     def __add__(self, other: HotaCounts) -> HotaCounts:
         return HotaCounts(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
@@ -78,7 +78,7 @@ def count_hota(frames: list[Pairs]) -> HotaCounts:
         track_frames[0, j] += 1
     alignment = shared_frames / np.maximum(true_frames + track_frames - shared_frames, EPS)
     matches = np.zeros((len(ALPHAS), len(true_ids), len(track_ids)))
-    similarity_sum = _zeros()
+    similarity_sum = _make_zeros()
     for f, (i, j) in zip(frames, indices):
         # Pairs of similarity 0 may be assigned too. They are below every alpha.
         rows, columns = find_best_pairs(alignment[np.ix_(i, j)] * f.similarity)

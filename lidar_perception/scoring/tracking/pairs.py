@@ -19,7 +19,7 @@ from lidar_perception.scoring.kitti.camera_objects import CameraObjects, to_came
 from lidar_perception.scoring.kitti.protocol import EPS, NEIGHBOURS, compute_image_iou
 from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
 
-MAX_OCCLUSION, MAX_TRUNCATION = 2, 0  # maximum levels, as in the tracking layout
+MAX_OCCLUSION, MAX_TRUNCATION = 2, 0  # maximum levels in KITTI's tracking labels
 MIN_HEIGHT = 25.0  # minimum height of the 2D box in pixels
 MAX_DONT_CARE_FRACTION = 0.5  # maximum fraction of a box inside a DontCare region
 MAX_CENTRE_DISTANCE = 2.0  # distance of centres in metres at which the similarity becomes 0
