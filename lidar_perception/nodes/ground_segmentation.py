@@ -94,8 +94,7 @@ class GroundSegmentation(ManagedNode):
         """Publish ~/output/ground, nonground and obstacles if they have subscribers.
 
         Args:
-            msg: the cloud.
-            frame: its visible points.
+            frame: the M visible points of the cloud.
             indices: (M,) indices of these points in the cloud.
             ground: (M,) bool; computed here if it is None.
         """

@@ -122,12 +122,9 @@ class _MessageHandler:
     retries_clouds: bool  # True if waiting clouds may need these messages
 
     def __call__(self, data: Any, may_wait: bool = False) -> str | None:
-        """Handle a message, as CDR or decoded.
+        """Handle a message, as CDR or decoded; return a description of the data that a cloud still needs, or None.
 
         A cloud that may wait and still needs data is not passed to the callback.
-
-        Returns:
-            A description of the data that a cloud still needs, or None.
         """
         missing = None
         try:

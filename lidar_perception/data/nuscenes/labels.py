@@ -185,7 +185,6 @@ def _link_neighbours(tables: Tables, tokens: dict[str, int], numbers: array, lin
     """Return the rows (K, 2) of the previous and next label of the same object, -1 = none.
 
     Args:
-        tables: tables of the data set, for error messages.
         tokens: number of each label, by its token.
         numbers: (K,) number of the label in each row.
         links: (2 K,) numbers of the previous and next labels, -1 = none.
