@@ -143,7 +143,7 @@ def find_pose_file(sequence: Path) -> Path | None:
 
 
 def _read_poses(sequence: Path) -> tuple[np.ndarray, Path, list[str]] | None:
-    """Return the pose (4, 4) of the LiDAR in the camera frame, the pose file, and its lines; None without a pose file."""
+    """Return the pose (4, 4) of the LiDAR in the camera frame, the pose file and its lines; None without that file."""
     if (poses := find_pose_file(sequence)) is None:
         return None
     calibration = sequence / CALIBRATION_FILE
