@@ -46,7 +46,10 @@ def group_by_id(ids: np.ndarray, min_points: int = 1) -> Groups:
 
 
 def count_clusters(labels: np.ndarray) -> int:
-    """Return the number of clusters K, given the labels (N,) of the points between 0 and K.
+    """Return the number of clusters K.
+
+    Args:
+        labels: (N,) cluster id of each point, 1 to K, or 0 for none.
 
     Raises:
         InputError: K is larger than N, so arrays with K rows could exceed the memory. Call

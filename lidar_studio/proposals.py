@@ -53,7 +53,12 @@ class SilhouetteSeed:
 
 @dataclass(frozen=True)
 class SizeSeed:
-    """Class name (from CLASSES), and length, width and height (m) of another object that a person clicked."""
+    """Class and size of a clicked object that is not a pedestrian.
+
+    Attributes:
+        class_name: Name from CLASSES.
+        size: Length, width and height, metres.
+    """
 
     class_name: str
     size: Size

@@ -226,7 +226,10 @@ def find_header(msg: Any) -> Any | None:
 
 
 def list_marker_keys(array: Any) -> frozenset[tuple[str, int]]:
-    """Return (ns, id) of each marker that an array, or its rows, adds.
+    """Return (ns, id) of each ADD marker.
+
+    Args:
+        array: A MarkerArray, or a list of MarkerRow.
 
     Pass the result as `previous` when you build the next array.
     """

@@ -105,7 +105,7 @@ def test_points_in_box_accepts_no_points_and_negative_sizes():
 
 
 @given(st.floats(-1e4, 1e4))
-def test_wrapped_angles_are_equal_and_in_the_interval(angle):
+def test_wrapped_angles_are_equivalent_and_in_range(angle):
     wrapped = wrap_angle(angle)
     assert -np.pi <= wrapped < np.pi
     turns = (angle - wrapped) / (2 * np.pi)

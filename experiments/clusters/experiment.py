@@ -43,7 +43,7 @@ def measure_segmented_frame(frames: Sequence[Frame], number: int) -> dict[str, A
 
 
 def make_segmentation_report(records: list[dict[str, Any]]) -> list[Section]:
-    """Make the report from the records of measure_segmented_frame(), without skipped frames."""
+    """Make the sections of the report from the records of measure_segmented_frame(). Skipped frames are ignored."""
     records = [record for record in records if "skipped" not in record]
     return make_segmentation_sections(records, records[0]["data"] if records else "KITTI")
 
@@ -64,7 +64,7 @@ def measure_detected_frame(
 def make_detection_report(
     records: list[dict[str, Any]], *, models: Mapping[str, TrainedModel] = NO_MODELS
 ) -> list[Section]:
-    """Make the report from the records of measure_detected_frame(), without skipped frames."""
+    """Make the sections of the report from the records of measure_detected_frame(). Skipped frames are ignored."""
     records = [record for record in records if "skipped" not in record]
     data = records[0]["data"] if records else "KITTI"
     return [*make_detection_sections(records, data, models), make_drive_section(records, data)]
@@ -84,7 +84,7 @@ def measure_frame(frames: Sequence[Frame], number: int, *, models: Mapping[str, 
 
 
 def make_sections(records: list[dict[str, Any]], *, models: Mapping[str, TrainedModel]) -> list[Section]:
-    """Make the report from the records of measure_frame(), without skipped frames."""
+    """Make the sections of the report from the records of measure_frame(). Skipped frames are ignored."""
     segmentation_records = [{**r, **r["segmentation"]} for r in records if r.get("segmentation")]
     return [*make_segmentation_report(segmentation_records), *make_detection_report(records, models=models)]
 

@@ -71,8 +71,8 @@ def open_network(weights: str, sensor_height: float) -> Detector:
 def measure_diagonals(scan: PointCloud, truth: GroundTruth, sensor_height: float) -> dict[str, list[list[float]]]:
     """Measure the BEV diagonals of labelled boxes and of clusters (Table 2 and Figure 13).
 
-    A cluster has the class of the box that contains most of its points, and at least MIN_FRACTION of
-    them. Only boxes and clusters in the range of the network are used.
+    A cluster gets the class of the box that contains most of its points, provided that the box
+    contains at least MIN_FRACTION of them. Only boxes and clusters in the range of the network are used.
     """
     view = NormalizedView.of(scan, SensorPoseParams(height=sensor_height), **AHEAD).frame
     true_boxes = truth.boxes + np.array([0, 0, sensor_height - SENSOR_HEIGHT, 0, 0, 0, 0])

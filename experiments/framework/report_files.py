@@ -14,7 +14,7 @@ FOLDERS = {"tables": ".csv", "figures": ".png"}
 def list_report_files(folder: Path) -> list[Path]:
     """List the files of the report in a folder.
 
-    Only tables and figures named in report.json are listed, so that other files are kept.
+    Only tables and figures named in report.json are listed; other files do not belong to the report.
     """
     names = []
     with suppress(OSError, ValueError, KeyError, TypeError):  # the report is missing or has another format

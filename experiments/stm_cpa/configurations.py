@@ -135,8 +135,8 @@ def make_sections(records: list[dict[str, Any]]) -> list[Section]:
     """Make the report: all variants, and those without the seed pedestrian."""
     records = [record["variants"] for record in records if "skipped" not in record]
     return [
-        _make_section("The configurations", tuple(VARIANTS), records, "all"),
-        _make_section("The seed left out", tuple(WITHOUT_SEED), records, "without_seed"),
+        _make_section("Configurations", tuple(VARIANTS), records, "all"),
+        _make_section("Without the seed pedestrian", tuple(WITHOUT_SEED), records, "without_seed"),
     ]
 
 
@@ -145,9 +145,9 @@ def _make_section(title: str, names: Sequence[str], records: list[dict[str, Any]
 
     Args:
         title: Title of the section.
-        names: Variants.
-        records: Variants of each frame.
-        key: Prefix of the names of the tables.
+        names: Names of the variants, the reference first.
+        records: Result of score_boxes() by variant, for each frame.
+        key: Prefix of the table names.
     """
     counts = {
         name: stack_counts([[r[name][k] for k in COUNTS] for r in records], 3, len(RANGE_NAMES)) for name in names

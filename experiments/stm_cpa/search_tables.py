@@ -19,8 +19,8 @@ def make_search_section(records: list[dict]) -> Section:
     """Make the section about the search from the records of measure_frame()."""
     eps, min_samples = NUMBERS.search_eps, NUMBERS.search_min_samples
     positives = stack_counts([r["search"] for r in records], len(eps) * len(min_samples), 2, len(RANGE_NAMES))
-    labels = stack_counts([r["pedestrians"] for r in records], 1, len(RANGE_NAMES))
-    counts = np.stack([positives[:, :, 0], positives[:, :, 1], labels - positives[:, :, 0]], axis=1)
+    label_counts = stack_counts([r["pedestrians"] for r in records], 1, len(RANGE_NAMES))
+    counts = np.stack([positives[:, :, 0], positives[:, :, 1], label_counts - positives[:, :, 0]], axis=1)
     estimates = bootstrap(counts, lambda sums: compute_rates(*np.moveaxis(sums, -3, 0)))
     sums = counts.sum(axis=0).astype(int)
     settings = [(e, n) for e in eps for n in min_samples]
@@ -31,7 +31,7 @@ def make_search_section(records: list[dict]) -> Section:
 
     best_rows, all_rows = [], []
     for group, name in enumerate(RANGE_NAMES):
-        if labels[:, 0, group].sum() == 0:
+        if label_counts[:, 0, group].sum() == 0:
             continue
         all_rows += [(name, *make_row(k, group)) for k in range(len(settings))]
         paper_setting = settings.index((_find_paper_eps(name), paper.MIN_SAMPLES))

@@ -37,7 +37,7 @@ DATASETS, LABELS = tuple(LAYOUTS), tuple(FORMATS)
 )
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Bag, folder or file to create.")
 @path_option(
-    "--data", "Same as DATA. If both are given, DATA is the path of labels of this drive, which are converted.", "DRIVE"
+    "--data", "Drive to convert, as DATA. To convert labels, give their drive here and their path as DATA.", "DRIVE"
 )
 @click.option(
     "--from",

@@ -28,7 +28,7 @@ from lidar_perception.tracking.drive_tracker import DriveTracker
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.types import CLASSES
 
-# Output files of a run, except the journal, and the bag, which is always replaced.
+# Output files of a run. Not listed: the journal, and the bag, which is always replaced.
 OUTPUT_PATTERNS = ("kitti/**/*.txt", "detections.json", "detections.csv", "openlabel/*.json", "png/**/*.png")
 
 

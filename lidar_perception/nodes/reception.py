@@ -165,7 +165,7 @@ class Reception:
             self._disconnect()
             self._connect()
             self.arrivals.record_interruption(0)
-            self.node.get_logger().info(f"{self.topic} is now received {self._describe_reliability()}")
+            self.node.get_logger().info(f"reconnected to {self.topic} ({self._describe_reliability()})")
         if self.output is not None:
             self.last_publishers = self.list_publishers() or self.last_publishers
             return
@@ -181,7 +181,7 @@ class Reception:
         self.reliability = reliability
         self.node.destroy_subscription(self.subscription)
         self._subscribe()
-        self.node.get_logger().info(f"{self.topic} is now received {self._describe_reliability()}")
+        self.node.get_logger().info(f"reconnected to {self.topic} ({self._describe_reliability()})")
 
     def _describe_reliability(self) -> str:
         if self.output is not None:
@@ -255,7 +255,7 @@ class Reception:
             self.deliver_trigger.trigger()
 
     def values(self) -> dict[str, Any]:
-        """Return the values for the diagnostics."""
+        """Return the counts, rates and delays of this input for /diagnostics."""
         if not self.is_open:
             return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped}
         rate, expected = self.arrivals.measure_rate(), self.get_expected_rate()

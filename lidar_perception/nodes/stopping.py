@@ -72,7 +72,7 @@ class Stop:
         """End the process with this code, at the latest after guard.TEARDOWN_S seconds."""
         self._state[:] = self._closed_phase, code
         self.on_signal = lambda: None
-        os.kill(os.getpid(), signal.SIGTERM)  # wakes the guard in case no signal has
+        os.kill(os.getpid(), signal.SIGTERM)  # wakes the guard if no signal has woken it yet
 
 
 def _relay_first_signal(arrived: int, loaded: threading.Event, pipe: int) -> None:

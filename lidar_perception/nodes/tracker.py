@@ -20,8 +20,8 @@ from msg_utils.stamps import to_ns
 class TrackerNode(ManagedNode):
     """Tracks boxes from frame to frame.
 
-    A frame without detections must be sent as an array with its stamp. A MarkerArray then contains a
-    DELETE or DELETEALL marker with the header of the frame.
+    Frames without detections must be sent, too: as an empty Detection3DArray with the header of the
+    frame, or as a MarkerArray with a DELETE or DELETEALL marker that has this header.
     """
 
     def __init__(self, **options: Any):

@@ -18,7 +18,7 @@ from time import perf_counter, sleep
 from typing import Any
 
 REPORT_AFTER_S = 1.0  # minimum duration of compilations and waits that are reported
-REPORT_INTERVAL_S = 10.0  # compilation time between two progress reports
+REPORT_INTERVAL_S = 10.0  # time between two progress reports during compilation
 POLL_INTERVAL_S = 0.1  # time between checks for the end of a compilation or a wait
 
 COMPILING_MESSAGE = "compiling numeric code for this machine, once: about a minute on a free core; the result is cached"

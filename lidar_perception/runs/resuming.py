@@ -24,7 +24,7 @@ def lock_file(descriptor: int, path: Path) -> str:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise InputError(f"another process is writing to {path}; wait until it ends, or end it") from None
+        raise InputError(f"another process is writing to {path}; wait until it ends, or stop it") from None
     except OSError as error:
         return error.strerror or str(error)
     return ""

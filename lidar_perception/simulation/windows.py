@@ -38,7 +38,7 @@ class Grid(NamedTuple):
         margin: Margin in azimuth, rad.
         is_moving: True if the sensor or a solid moves.
         lift: (rings,) start of each beam on the z axis, m.
-        rise, fall: (rings,) slopes of the highest and the lowest ray of each beam.
+        max_slope, min_slope: (rings,) slopes of the highest and the lowest ray of each beam.
     """
 
     columns: int
@@ -51,8 +51,8 @@ class Grid(NamedTuple):
     max_range: float
     is_moving: bool
     lift: np.ndarray
-    rise: np.ndarray
-    fall: np.ndarray
+    max_slope: np.ndarray
+    min_slope: np.ndarray
 
 
 def find_windows(solids: Solids, sensor: Sensor, motion: Motion = NO_MOTION, margin: float = 0.0) -> Windows:
@@ -67,7 +67,7 @@ def find_windows(solids: Solids, sensor: Sensor, motion: Motion = NO_MOTION, mar
     relative_velocity = solids.velocity - np.asarray(motion.velocity, np.float64)
     times = sensor.compute_firing_times() - motion.stamp / sensor.rate
     elevations, limit = np.asarray(sensor.elevations), np.pi / 2 - 1e-6
-    rise, fall = (np.tan(np.clip(elevations + m, -limit, limit)) for m in (margin + 1e-9, -margin - 1e-9))
+    max_slope, min_slope = (np.tan(np.clip(elevations + m, -limit, limit)) for m in (margin + 1e-9, -margin - 1e-9))
     grid = Grid(
         sensor.columns,
         float(sensor.rate),
@@ -79,8 +79,8 @@ def find_windows(solids: Solids, sensor: Sensor, motion: Motion = NO_MOTION, mar
         float(sensor.max_range),
         bool(relative_velocity.any() or motion.yaw_rate),
         sensor.compute_origins()[:, 2].copy(),
-        rise,
-        fall,
+        max_slope,
+        min_slope,
     )
     count = len(solids)
     windows = Windows(
@@ -205,7 +205,7 @@ def _fill_beams(corners, box_axes, direction, grid, beams):
         max_distance = max(max_distance, math.hypot(corners[n, 0], corners[n, 1]))
         bottom, top = min(bottom, corners[n, 2]), max(top, corners[n, 2])
     for r in range(len(beams)):
-        highest = grid.lift[r] + max(min_distance * grid.rise[r], max_distance * grid.rise[r])
-        lowest = grid.lift[r] + min(min_distance * grid.fall[r], max_distance * grid.fall[r])
+        highest = grid.lift[r] + max(min_distance * grid.max_slope[r], max_distance * grid.max_slope[r])
+        lowest = grid.lift[r] + min(min_distance * grid.min_slope[r], max_distance * grid.min_slope[r])
         beams[r] = highest >= bottom and lowest <= top and min_distance <= grid.max_range
     return min_distance

@@ -20,7 +20,7 @@ from lidar_perception.types import CLASSES, PEDESTRIAN
 HEIGHT_NOISE = 0.2  # standard deviation of a measured z, m
 HEIGHT_DRIFT = 0.3  # process noise density of an object's z, m/s^0.5
 MAX_SIZE_WEIGHT = 20.0  # maximum weight of the mean size, a sum of scores
-CLASS_LEAD = 0.5  # lead in evidence that another class needs to become the class of a track
+CLASS_LEAD = 0.5  # a track changes its class if the evidence for another class is higher by more than this
 HIT_MEMORY = 20.0  # time constant with which hits and heading agreement fade, in frames
 DECAY = 1.0 - 1.0 / HIT_MEMORY
 MODEL_IDS = np.array(MODEL_BY_CLASS_ID)

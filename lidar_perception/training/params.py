@@ -243,7 +243,13 @@ class PointPillarsTraining(SceneTraining):
         low=0.0,
         high=1000.0,
     )
-    aside: float = param(0.0, "Train only up to this far to each side, see ahead.", unit="m", low=0.0, high=1000.0)
+    aside: float = param(
+        0.0,
+        "Maximum lateral distance for training; 0 and large numbers as for `ahead`.",
+        unit="m",
+        low=0.0,
+        high=1000.0,
+    )
     score: str = param(
         "bev",
         "Score that selects the best weights. bev: mean BEV AP at the "

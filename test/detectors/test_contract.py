@@ -127,7 +127,7 @@ def test_ego_vehicle_is_dropped_for_any_heading(seed):
     [SensorPoseParams(), SensorPoseParams(height=2.4), SensorPoseParams(roll=np.pi), SensorPoseParams(height=6.0)],
 )
 def test_ego_vehicle_is_dropped_and_nearest_car_is_kept(pose):
-    """The roof is detected in three parts, as in KITTI, for sensors up to MAX_MAST_M above the car."""
+    """Drop three boxes on the ego vehicle's own roof, as in KITTI, for sensors up to MAX_MAST_M above it."""
     offset = pose.height - SENSOR_HEIGHT
     roof = np.array(
         [

@@ -71,7 +71,7 @@ def test_object_scores_equal_hand_computed_values():
 
 
 def make_panel(x, y, width=1.0):
-    """Return points of a wall of 1 x 1 m at (x, y), seen from the front."""
+    """Return the points of a wall, 1 m high and `width` metres wide, that begins at (x, y)."""
     z, side = (g.ravel() for g in np.meshgrid(np.arange(-1, 0, 0.05), np.arange(0, width, 0.03)))
     return np.stack([np.full(len(z), x), y + side, z], axis=1).astype(np.float32)
 

@@ -175,7 +175,7 @@ def test_fusion_file_can_be_read_after_its_folder_is_moved(others, tmp_path, mon
 
 
 @pytest.mark.parametrize("curves", [[], 0, "", {}, {"Car": {}}])
-def test_invalid_curves_without_intensity_are_rejected(curves, tmp_path):
+def test_invalid_classes_without_intensity_are_rejected(curves, tmp_path):
     path = tmp_path / "fused.json"
     path.write_text(json.dumps({**json.loads(SHIPPED_FILE.read_text()), "classes_without_intensity": curves}))
     with pytest.raises(InputError, match=r"fused.json was not written by"):

@@ -66,8 +66,7 @@ def small_training(out: Path, *more: str) -> list[str]:
 
 
 def kill_when(condition, *arguments: str) -> None:
-    """Start a training in a fork of this process, which has imported torch, and kill it when condition() is
-    true."""
+    """Start a training run in a fork of this process, which has imported torch; kill it once condition() is true."""
     process = multiprocessing.get_context("fork").Process(target=cli.main, args=(arguments,))
     process.start()
     end = time.monotonic() + 240
@@ -123,7 +122,7 @@ def test_run_directory_is_locked(tmp_path):
 
 
 @pytest.mark.parametrize("more", [[], ["--resume"]])
-def test_weights_of_another_run_in_out_are_not_replaced(tmp_path, more):
+def test_run_that_would_replace_other_weights_is_rejected(tmp_path, more):
     weights = tmp_path / "run/best.safetensors"
     weights.parent.mkdir()
     shutil.copy(find_pointnet_weights(PointNetParams()), weights)

@@ -92,7 +92,7 @@ def test_second_signal_ends_run_and_keeps_saved_state(uninterrupted_run, tmp_pat
 
 
 def fork(target, *arguments) -> multiprocessing.Process:
-    """Run target in a fork of this process, which has imported torch."""
+    """Run target in a fork of this process, where torch is already imported."""
     process = multiprocessing.get_context("fork").Process(target=target, args=arguments)
     process.start()
     return process

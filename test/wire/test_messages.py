@@ -1,4 +1,4 @@
-"""Conversion of messages, in both kinds of message classes."""
+"""Conversion of messages, with the message classes of rosbags and of ROS."""
 
 from __future__ import annotations
 

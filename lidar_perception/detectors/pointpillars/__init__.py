@@ -1,1 +1,1 @@
-"""Learned detectors: EG-PointPillars (paper B), from a cloud to boxes."""
+"""EG-PointPillars (paper B), a network that detects boxes in a cloud."""

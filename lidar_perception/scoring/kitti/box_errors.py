@@ -17,7 +17,7 @@ RANGES = (0.0, 15.0, 30.0, 45.0, np.inf)  # limits of the range bins in metres
 ERRORS = ("away", "aside", "bottom", "length", "width", "height", "yaw")
 MIN_SCORE = 0.2  # minimum score of the boxes to analyse
 MIN_BEV_AP = 20.0  # minimum BEV AP for a diagnosis, in percent
-MIN_AP_RATIO = 4  # minimum ratio of BEV AP to 3D AP if heights are wrong
+MIN_AP_RATIO = 4  # ratio of BEV AP to 3D AP above which wrong heights are suspected
 MAX_MEDIAN_ERROR = 0.1  # maximum median height error without bias, in metres
 
 

@@ -1,1 +1,1 @@
-"""Values, warnings and files about a measured sensor."""
+"""Report on a measured sensor: values, warnings and files."""
