@@ -11,6 +11,7 @@ from lidar_perception.candidates.pipeline import refine_segmented
 from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud, fit_grounded_boxes
 from lidar_perception.candidates.warm_up import warm_up_candidates
+from lidar_perception.intensity import StreamScale
 from lidar_perception.nodes.inputs import SeedInput
 from lidar_perception.nodes.interfaces import CLOUD
 from lidar_perception.nodes.managed import ManagedNode
@@ -20,6 +21,8 @@ from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import read_cluster_ids, read_column, to_point_cloud
 from msg_utils.stamps import to_ns
+
+INFERRED = 0.0  # maximum intensity that means: infer it from the clouds
 
 
 class CandidateRefinement(ManagedNode):
@@ -36,11 +39,14 @@ class CandidateRefinement(ManagedNode):
             warm_up_candidates(PipelineParams(**vars(self.params)), segmented=True)
         self.results = CandidateOutputs(self)
         self.seed = SeedInput(self, self.on_cloud)
+        self.scale = StreamScale()
         self.inputs.subscribe("points", CLOUD, self.seed.add_cloud)
 
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.diagnostics.measure_frame(to_ns(msg.header.stamp)):
-            frame, indices = to_point_cloud(msg)
+            frame, indices = to_point_cloud(
+                msg, INFERRED if self.params.seed.source == "automatic" else None, self.scale
+            )
             frame = self.transforms.find_placement(msg.header).level_frame(frame)
             ground, clusters = read_column(msg, "ground", indices), read_cluster_ids(msg, indices)
             if clusters is None:

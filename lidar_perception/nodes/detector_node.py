@@ -66,6 +66,7 @@ class DetectorNode(ManagedNode):
         self.sensor = SensorCheck(self)
         self.results = DetectionOutputs(self, self.steps)
         network_params: Any = self._get_network_params(self.params)
+        fallback = None
         if self.allows_custom and (reference := find_reference(network_params.weights)):
             self.detector = load_custom_detector(
                 reference, network_params.device, network_params.range, params=self.params, group=self.group
@@ -74,9 +75,12 @@ class DetectorNode(ManagedNode):
         else:
             self.detector = self._load_network()
             name = self.describe_network(self.detector.networks[0].config)
+            fallback = self.detector.fallback
         self.diagnostics.counts.update(
             network=f"{name}, {' '.join(self.detector.classes)}", device=self.detector.device
         )
+        if fallback:
+            self.diagnostics.report(WARN, fallback)
         self.inputs.subscribe("points", CLOUD, self.on_points)
 
     def _get_network_params(self, params: Any) -> NetworkParams:
@@ -89,8 +93,6 @@ class DetectorNode(ManagedNode):
         if detector.warning:  # not reported as the state, which shows what the node waits for
             self.diagnostics.counts["doubt"] = detector.warning
             self.get_logger().warning(detector.warning)
-        if detector.fallback:
-            self.diagnostics.report(WARN, detector.fallback)
         return detector
 
     def _load_on_device(self) -> Any:

@@ -15,7 +15,6 @@ from lidar_perception.candidates.params import SeedParams
 from lidar_perception.candidates.seed_sources import SeedSource, make_click_source, make_truth_source
 from lidar_perception.candidates.seeds import Seed, load_seeds
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud
-from lidar_perception.detectors.automatic_seed import make_automatic_source, warm_up_automatic_seed
 from lidar_perception.nodes.graph import make_relative
 from lidar_perception.nodes.interfaces import LATCHED, MARKERS, RELIABLE, SENSOR_DATA
 from lidar_perception.nodes.runtime import LidarNode
@@ -152,6 +151,7 @@ class SeedInput:
         self.new_clicks: deque[Any] = deque()
         self.clicked_seeds: tuple[Seed, ...] = ()
         self.loaded_templates: tuple[str, tuple[Seed, ...]] | None = None
+        self.is_automatic_seed_warm = False
         self.matcher = StampMatcher(self._deliver_with_truth, on_drop=self._count_dropped)
         node.inputs.subscribe("ground_truth", MARKERS, self._on_truth, RELIABLE)
         node.inputs.subscribe(
@@ -161,8 +161,7 @@ class SeedInput:
         if self.params.source == "file":
             self._load_templates()  # a missing file is reported before the first cloud
         elif self.params.source == "automatic":
-            with lock_compilation(node.get_logger().info):
-                warm_up_automatic_seed()
+            self._warm_up_automatic_seed()
 
     def open(self) -> None:
         """Do nothing; the node opens its subscriptions."""
@@ -181,9 +180,20 @@ class SeedInput:
         elif self.params.source == "click":
             self.deliver(msg, partial(self._make_clicked_seeds, msg.header))
         elif self.params.source == "automatic":
+            self._warm_up_automatic_seed()
+            from lidar_perception.detectors.automatic_seed import make_automatic_source
+
             self.deliver(msg, make_automatic_source(self.params))
         else:
             self.deliver(msg, lambda _: self._load_templates())
+
+    def _warm_up_automatic_seed(self) -> None:
+        if not self.is_automatic_seed_warm:
+            from lidar_perception.detectors.automatic_seed import warm_up_automatic_seed
+
+            with lock_compilation(self.node.get_logger().info):
+                warm_up_automatic_seed()
+            self.is_automatic_seed_warm = True
 
     def _load_templates(self) -> tuple[Seed, ...]:
         if self.loaded_templates is None or self.loaded_templates[0] != self.params.file:

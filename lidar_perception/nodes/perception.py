@@ -46,7 +46,9 @@ class Perception(ManagedNode):
 
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.diagnostics.measure_frame(to_ns(msg.header.stamp)):
-            frame, cloud_indices, params = self.sensor.read_frame(msg)
+            frame, cloud_indices, params = self.sensor.read_frame(
+                msg, with_intensity=self.params.seed.source == "automatic"
+            )
             segmented_cloud = segment_cloud(frame, self.camera.get(msg.header, params.view), params)
             problem = diagnose_empty(
                 len(frame), segmented_cloud.ground, segmented_cloud.cluster_ids

@@ -24,7 +24,7 @@ class DriveTracker:
     """Tracker for the detections of a recording: tracker(frame, detections) -> Tracks.
 
     Call it for each frame in order of time. All tracks end when a new drive begins: at a new
-    sequence or, if the recording has no sequences (as a bag), at a jump of the stamps, see
+    sequence or, if the recording has no sequences (such as a bag), at a jump of the stamps, see
     data.frame. Track ids are unique within the recording.
 
     Args:

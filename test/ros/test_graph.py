@@ -27,7 +27,7 @@ from msg_utils.point_cloud2 import to_array
 PAPER_C = {"ground.method": "cloth", "clustering.method": "euclidean", "boxes.shape": "l_shape"}
 RUNS = {  # single process, processes, parameters in addition to PAPER
     "three nodes of paper C": (False, True, PAPER_C),
-    "the same in one process": (False, False, PAPER_C),
+    "the same in one process, automatic seed": (False, False, {**PAPER_C, "seed.source": "automatic"}),
     "one node, patchwork": (
         True,
         True,

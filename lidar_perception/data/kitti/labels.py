@@ -50,7 +50,7 @@ def parse_lines(path: Path, known_only: bool = False) -> list[tuple[int, dict]]:
 
 
 def parse_tracking_lines(path: Path) -> list[tuple[int, int, dict]]:
-    """Return (line number from 1, frame number, result of parse_label with track_id) for each line of label_02"""
+    """Return (line number from 1, frame number, result of parse_label with track_id) for each line of a file."""
     labels = []
     for i, line in _read_lines(path):
         try:

@@ -162,11 +162,11 @@ def read_frame_list(path: Path) -> dict[str, int]:
 
 
 def _read_stamps(drive: Path, numbers: Sequence[int], required: bool) -> list[int]:
-    """Return the stamps in timestamps.txt in ns, such as 2011-09-26 13:02:25.594360375 (UTC).
+    """Return the stamps, in ns, of the scans with these numbers from timestamps.txt.
 
-    Line i belongs to scan number i, and is blank if the scan is missing. In files without blank
-    lines, the i-th line belongs to the i-th scan. The result is [] if the file does not exist and
-    is not required.
+    A line is a UTC time such as 2011-09-26 13:02:25.594360375. Line i belongs to scan number i, and
+    is blank if the scan is missing. In files without blank lines, the i-th line belongs to the i-th
+    scan. The result is [] if the file does not exist and is not required.
     """
     path = drive / "velodyne_points/timestamps.txt"
     if not (required or path.exists()):

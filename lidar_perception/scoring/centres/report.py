@@ -94,13 +94,13 @@ def collect_boxes(candidates: Candidates) -> dict[str, np.ndarray]:
 def make_seed_source(truth: np.ndarray, templates: Sequence[Seed] | None, params: PipelineParams) -> SeedSource:
     """Make the source of a frame's seeds.
 
-    Without templates the seed is a labelled pedestrian of truth (M, 7), as in the paper. Otherwise
-    params.seed.source selects the source.
+    Unless params.seed.source is "automatic", the seeds are the templates or, without any, a labelled
+    pedestrian of truth (M, 7), as in the paper.
     """
-    if templates is None:
-        return make_truth_source(truth)
     if params.seed.source == "automatic":
         return make_automatic_source(params.seed)
+    if templates is None:
+        return make_truth_source(truth)
     return make_fixed_source(*templates)
 
 
