@@ -84,7 +84,7 @@ def cluster_range_image(xyz: np.ndarray, params: RangeImageParams = RangeImagePa
 def _link_pixels(
     image: np.ndarray, xyz: np.ndarray, ranges: np.ndarray, row_offset: int, column_offset: int, min_angle: float
 ) -> np.ndarray:
-    """Return pairs (2, E) of linked pixels that are `down` rows and `right` columns apart."""
+    """Return pairs (2, E) of linked pixels that are `row_offset` rows and `column_offset` columns apart."""
     a, b = image[: len(image) - row_offset], np.roll(image, -column_offset, axis=1)[row_offset:]
     is_pair = (a >= 0) & (b >= 0)
     a, b = a[is_pair], b[is_pair]

@@ -19,6 +19,7 @@ from lidar_perception.ground.surface import fit_ground_surface
 from lidar_perception.types import PEDESTRIAN, SENSOR_HEIGHT, Detections, PointCloud
 
 MAX_SEEDS = 8
+MAX_GROUND_DISTANCE_M = 100.0  # maximum |x| and |y| of the ground points that are used
 
 
 def make_automatic_source(params: SeedParams = SeedParams()) -> SeedSource:
@@ -45,7 +46,9 @@ def classify_pedestrians(segmented: SegmentedCloud) -> np.ndarray:
     The PointNet of the fused detector classifies them. The probability is -1 for clusters that are
     too large or too small for a person, or have too few points for a seed.
     """
-    surface = fit_ground_surface(segmented.xyz.compress(segmented.ground, axis=0), -SENSOR_HEIGHT)
+    is_near = (np.abs(segmented.xyz[:, :2]) <= MAX_GROUND_DISTANCE_M).all(axis=1) & np.isfinite(segmented.xyz[:, 2])
+    ground = segmented.xyz.compress(segmented.ground & is_near, axis=0)
+    surface = fit_ground_surface(ground, -SENSOR_HEIGHT)
     view = NormalizedView.of(PointCloud(segmented.xyz, segmented.intensity)).flatten(surface)
     sizes = np.bincount(segmented.cluster_ids, minlength=len(segmented.boxes) + 1)[1:]
     indices = np.flatnonzero(is_person_sized(segmented.boxes) & (sizes >= MIN_POINTS))
@@ -55,7 +58,7 @@ def classify_pedestrians(segmented: SegmentedCloud) -> np.ndarray:
     probabilities[indices], _ = _load_classifier().classify(
         Detections.of(boxes, PEDESTRIAN, np.ones(len(boxes))),
         view.frame.take(np.flatnonzero(~segmented.ground)),
-        view.frame.xyz.compress(segmented.ground, axis=0),
+        view.frame.xyz.compress(segmented.ground & is_near, axis=0),
         np.ones(len(boxes), bool),
     )
     return probabilities

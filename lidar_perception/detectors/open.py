@@ -196,7 +196,7 @@ def check_weights(path: Path, height: float) -> list[str]:
     """Return warnings about a file of weights, for a sensor `height` metres above the ground.
 
     The warnings concern a different sensor height in training, uncalibrated scores, and classes
-    that are never detected. Exported networks are not checked.
+    that are never detected. The sensor height of exported networks is not checked.
     """
     if path.suffix == FUSION_SUFFIX:
         from lidar_perception.detectors.fused.fusion import read_fusion

@@ -41,7 +41,6 @@ class CampusKind:
     floor_objects: float = 0.5  # objects per 100 square metres
     edge_objects: float = 18.0  # objects along the edges, per 100 m
     benches: float = 5.0  # benches along the edges, per 100 m
-
     walkers: float = 0.0  # groups walking along x, per 100 m
     strollers: float = 0.0  # groups walking in any direction, per 100 square metres
     standers: float = 8.0  # standing groups, per 100 m

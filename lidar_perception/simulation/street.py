@@ -34,7 +34,6 @@ class StreetKind:
     cycle_lane_chance: float = 0.0  # probability of a bicycle lane
     parking_chance: float = 0.0  # probability of parking strips
     perpendicular_chance: float = 0.0  # probability of perpendicular parking
-
     sidewalk_width: tuple[float, float] = (1.6, 3.0)
     curb_height: float = 0.12
     crossing_distance: tuple[float, float] = (50.0, 120.0)  # distance from one side street to the next
@@ -45,7 +44,6 @@ class StreetKind:
     lamps: float = 3.0
     trees: float = 4.0
     clutter: float = 4.0
-
     walkers: float = 3.3
     standers: float = 0.12
     benches: float = 0.05

@@ -9,6 +9,7 @@ from candidate_samples import make_floor, make_person
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.params import SeedParams
 from lidar_perception.candidates.pipeline import find_candidates, segment_cloud
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud
 from lidar_perception.detectors.automatic_seed import classify_pedestrians, make_automatic_source
 from lidar_perception.geometry import points_in_box
 from lidar_perception.param_fields import with_values
@@ -53,6 +54,20 @@ def test_clouds_without_a_person_have_no_seed_and_no_candidates(xyz):
     segmented, candidates = find_candidates(PointCloud(xyz.astype(np.float32)), source, params=params)
     assert source(segmented) == ()
     assert len(candidates.stage1) == len(candidates.final) == 0
+
+
+@pytest.mark.parametrize("point", [(np.nan, 0, 0), (0, 0, np.inf), (2e7, -2e7, 0)], ids=["NaN", "inf", "far"])
+def test_unusable_and_distant_ground_points_have_no_effect(scan, point):
+    segmented = segment_cloud(scan.frame, params=PARAMS)
+    extended = SegmentedCloud(
+        np.arange(len(segmented.xyz) + 1),
+        np.concatenate([segmented.xyz, np.float32([point])]),
+        np.append(segmented.ground, True),
+        np.append(segmented.cluster_ids, np.int32(0)),
+        segmented.boxes,
+        intensity=np.append(segmented.intensity, np.float32(0.2)),
+    )
+    np.testing.assert_allclose(classify_pedestrians(extended), classify_pedestrians(segmented), atol=0.01)
 
 
 def test_cloud_has_no_seed_if_no_cluster_is_probable_enough(scan):

@@ -28,7 +28,7 @@ def match_centres(
 def assign_pairs(cost: np.ndarray, is_allowed_pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Assign rows to columns of a non-negative cost matrix (K, M).
 
-    Only pairs with allowed (K, M) bool are assigned. The number of pairs is maximal; among these
+    Only pairs with `is_allowed_pair` (K, M) bool are assigned. The number of pairs is maximal; among these
     assignments, the total cost is minimal. Returns rows (P,) and columns (P,).
     """
     # A forbidden pair costs more than all allowed pairs together.

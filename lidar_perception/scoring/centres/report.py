@@ -16,7 +16,7 @@ from lidar_perception.candidates.seed_sources import SeedSource, make_fixed_sour
 from lidar_perception.candidates.seeds import Seed, load_seeds
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame, Recording
-from lidar_perception.detectors.automatic_seed import make_automatic_source
+from lidar_perception.detectors.automatic_seed import make_automatic_source, warm_up_automatic_seed
 from lidar_perception.scoring.centres.matching import RANGE_NAMES, Score, find_range_bins
 from lidar_perception.scoring.kitti.camera_objects import select_in_image
 from lidar_perception.types import PEDESTRIAN, GroundTruth, InputError
@@ -64,6 +64,8 @@ def measure_candidates(params: PipelineParams, recording: Recording) -> Callable
     partial(measure_candidates, params) is a StartMeasurement of scoring.run.
     """
     warm_up()
+    if params.seed.source == "automatic":
+        warm_up_automatic_seed()
     templates = None if params.seed.source == "ground_truth" else load_seeds(params.seed.file)
     return partial(measure_frame, params=params, templates=templates)
 

@@ -111,7 +111,7 @@ def _count_at_threshold(
 ) -> RecallPoint:
     """Count matches, misses, false positives and id switches at one score threshold.
 
-    Appends the score of each match to `hits`. Updates `matched` in place: a track that has matched
+    Appends the score of each match to `hits`. Updates `has_matched` in place: a track that has matched
     once is never excused again, as in the paper's script.
     """
     tp = fn = fp = switches = objects = 0
