@@ -74,7 +74,9 @@ class Command(click.Command):
                 for flag in (*param.opts, *param.secondary_opts)
                 if flag.startswith("-")
             ]
-            remedy = suggest_name(error.option_name, flags) or f"; {ctx.command_path} --help lists them"
+            suggestions = (p.suggest(error.option_name) for p in self.params if isinstance(p, OptionWithHelp))
+            remedy = next(filter(None, suggestions), "") or suggest_name(error.option_name, flags)
+            remedy = remedy or f"; {ctx.command_path} --help lists them"
             raise click.UsageError(f"no such option {error.option_name}{remedy}", ctx) from None
 
 
@@ -83,11 +85,18 @@ class OptionWithHelp(click.Option):
 
     Args:
         list_values: Function from the other options to the text that lists the possible values.
+        suggest: Function from an unknown flag to a suggestion to use this option instead, or "".
     """
 
-    def __init__(self, *args: Any, list_values: Callable[[Mapping[str, Any]], str], **kwargs: Any):
+    def __init__(
+        self,
+        *args: Any,
+        list_values: Callable[[Mapping[str, Any]], str],
+        suggest: Callable[[str], str] = lambda flag: "",
+        **kwargs: Any,
+    ):
         super().__init__(*args, **kwargs)
-        self.list_values = list_values
+        self.list_values, self.suggest = list_values, suggest
 
     def is_help_requested(self, args: list[str]) -> bool:
         """Return True if the command line asks for the listing."""

@@ -22,6 +22,7 @@ from lidar_perception.detectors.contract import FUSED
 from lidar_perception.detectors.open import DetectorChoice, make_default_params
 from lidar_perception.detectors.params import RANGE_CHOICES
 from lidar_perception.nodes import NODES
+from lidar_perception.nodes.node_parameters import find_node_parameters
 from lidar_perception.param_fields import collect_fields, describe_fields, with_values
 from lidar_perception.runs.terminal import errors
 from lidar_perception.tracking.params import TrackingParams
@@ -117,6 +118,15 @@ class Assignment(click.ParamType):
         return name.removesuffix(":").strip(), text
 
 
+def _suggest_assignment(flag: str) -> str:
+    """Return how to set the parameter of a node that an unknown flag names; "" if there is none."""
+    parameter = flag.removeprefix("--").removeprefix("no-")
+    names_by_flag = {
+        name.replace(".", "-").replace("_", "-"): name for node in NODES for name in find_node_parameters(node)
+    }
+    return f"; parameters are given as --set {names_by_flag[parameter]}=VALUE" if parameter in names_by_flag else ""
+
+
 def settings_options(
     select: Callable[[Mapping[str, Any]], list[Algorithm]],
     example: str = "fused.scores.car=0.7",
@@ -150,6 +160,7 @@ def settings_options(
             "assignments",
             cls=OptionWithHelp,
             list_values=list_parameters,
+            suggest=_suggest_assignment,
             multiple=True,
             type=Assignment(),
             metavar="NAME=VALUE",

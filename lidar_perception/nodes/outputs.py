@@ -202,13 +202,13 @@ class CandidateOutputs:
         self.node.diagnostics.counts["candidates"] = len(candidates.final)
         if problem:
             self.node.diagnostics.report(WARN, problem)
+        elif self.node.params.seed.source == "automatic" or len(candidates.final):
+            self.node.diagnostics.report(OK, "detecting")
         elif len(candidates.stage1) == 0:
             self.node.diagnostics.report(WARN, "no cluster has the height of the seed; choose another seed")
-        elif len(candidates.final) == 0:
+        else:
             self.node.diagnostics.report(
                 WARN,
                 f"none of the {len(candidates.stage1)} clusters with the height of the seed matches it; "
                 "lower stm.threshold or choose another seed",
             )
-        else:
-            self.node.diagnostics.report(OK, "detecting")

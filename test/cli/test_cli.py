@@ -188,7 +188,7 @@ def test_info_lists_topics_that_are_not_read(tmp_path):
 def test_info_describes_a_recording_that_is_not_a_bag(kitti):
     text = run_command("info", kitti)
     assert f"{kitti}: KITTI object data, 2 frames, a camera, labelled boxes" in text
-    assert "10 Hz assumed" in text and "first cloud: 000000, " in text and "labels: " in text
+    assert "10 Hz assumed" in text and "first cloud: 000000, " in text and "labels of the first cloud: " in text
 
 
 def test_info_shows_topics_types_counts_and_length(bag):

@@ -81,7 +81,7 @@ def test_every_method_survives_invalid_clouds(values, send, process, results, sh
     node = "perception" if "clustering.method" in values else "ground_segmentation"
     rng = np.random.default_rng(0)
     xyz = read_xyz(good_cloud)
-    some = xyz[:2000]
+    some = xyz[:: len(xyz) // 2000][:2000]
     strange = {
         **{name: msg for name, (msg, _) in BAD.items()},
         "100 km": make_ros_cloud(np.concatenate([some, [[1e5, -1e5, 1e5]]])),

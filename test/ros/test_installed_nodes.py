@@ -103,7 +103,10 @@ def test_start_script_stops_at_signal_during_command(command, tmp_path):
         path.write_text(text)
         path.chmod(0o755)
     code = subprocess.call(
-        [script], env={"PATH": f"{tmp_path}:/usr/bin:/bin"}, start_new_session=True, stderr=subprocess.DEVNULL
+        ["/usr/bin/env", "--default-signal=INT", script],  # a shell cannot trap a signal that is ignored at its start
+        env={"PATH": f"{tmp_path}:/usr/bin:/bin"},
+        start_new_session=True,
+        stderr=subprocess.DEVNULL,
     )
     assert code == 0 or not signalled.exists()
 
