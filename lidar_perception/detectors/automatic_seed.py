@@ -47,8 +47,8 @@ def classify_pedestrians(segmented: SegmentedCloud) -> np.ndarray:
     too large or too small for a person, or have too few points for a seed.
     """
     is_near = (np.abs(segmented.xyz[:, :2]) <= MAX_GROUND_DISTANCE_M).all(axis=1) & np.isfinite(segmented.xyz[:, 2])
-    ground = segmented.xyz.compress(segmented.ground & is_near, axis=0)
-    surface = fit_ground_surface(ground, -SENSOR_HEIGHT)
+    is_near_ground = segmented.ground & is_near
+    surface = fit_ground_surface(segmented.xyz.compress(is_near_ground, axis=0), -SENSOR_HEIGHT)
     view = NormalizedView.of(PointCloud(segmented.xyz, segmented.intensity)).flatten(surface)
     sizes = np.bincount(segmented.cluster_ids, minlength=len(segmented.boxes) + 1)[1:]
     indices = np.flatnonzero(is_person_sized(segmented.boxes) & (sizes >= MIN_POINTS))
@@ -58,7 +58,7 @@ def classify_pedestrians(segmented: SegmentedCloud) -> np.ndarray:
     probabilities[indices], _ = _load_classifier().classify(
         Detections.of(boxes, PEDESTRIAN, np.ones(len(boxes))),
         view.frame.take(np.flatnonzero(~segmented.ground)),
-        view.frame.xyz.compress(segmented.ground & is_near, axis=0),
+        view.frame.xyz.compress(is_near_ground, axis=0),
         np.ones(len(boxes), bool),
     )
     return probabilities

@@ -99,7 +99,7 @@ def choose_source(requested: str, available: Collection[str]) -> str:
 
 
 def choose_recorded_source(has_poses: bool) -> str:
-    """Choose the best source of poses for the frames of a recording, with or without poses of its own."""
+    """Choose the best available source of poses for a recording, which may contain poses itself."""
     return choose_source("auto", [*["recording"] * has_poses, *["kiss_icp"] * has_odometry()])
 
 

@@ -204,7 +204,7 @@ def test_simulated_clock_works_after_cleanup(make_local_node, peer):
 
 
 def test_node_waits_for_missing_network_file(nodes, peer, late_weights, weights):
-    """Configuring fails until the file exists. A node with autostart then loads it by itself."""
+    """Configuring fails until the file exists. A node with autostart then loads it automatically."""
     reason = f"checkpoint not found: {late_weights}"
     managed_node, autostarted_node = f"waits/{NODE}", f"tries/{NODE}"
     for _ in range(2):
